@@ -10,7 +10,7 @@ from msgspec.structs import replace
 import mwdcal as mc
 from cli_support import EXAMPLE, read_csv, refused
 from cli_support import mwdcal as cli
-from mwdcal.errors import FitError
+from mwdcal.errors import FitError, InputError
 from mwdcal.files.depths import is_depth
 from mwdcal.sensor.profile import TableFormat
 
@@ -296,6 +296,22 @@ def test_the_name_that_the_user_gives_comes_before_others(tmp_path, laboratory):
 
 
 @pytest.mark.parametrize(
+    ("name", "unit", "got"),
+    [("Pos (km)", "", "km"), ("Pos", "cm", "cm"), ("Pos_mm", "m", "mm"), ("井 (千米)", "", "千米")],
+)
+def test_a_measured_depth_in_another_unit_of_length_is_refused(
+    tmp_path, laboratory, name, unit, got
+):
+    """The user who knows better states the unit in the answer."""
+    path = text_table(tmp_path / "WELL.csv", deep(name, METRES, unit))
+    for column in "md_m", "md_ft":
+        with pytest.raises(InputError, match=f"the unit must be m, ft or usft; got '{got}'"):
+            mc.survey(laboratory[1], path, column={column: name})
+    well = mc.survey(laboratory[1], path, column={"md_m": f"{name} (m)"})
+    assert well.path.md == pytest.approx(METRES)
+
+
+@pytest.mark.parametrize(
     ("typed", "message"),
     [
         ("md_m=Foo", "there is no column 'Foo'; found"),
@@ -366,6 +382,25 @@ def test_a_length_of_hole_is_the_measured_depth_where_nothing_else_may_be(
     path = text_table(tmp_path / "WELL.csv", {**table, **more})
     well = mc.survey(laboratory[1], path)
     assert (None if well.path is None else pytest.approx(well.path.md[-1])) == end
+
+
+OTHER_LENGTHS = (
+    "TVD (m);Water depth (m);Depth m TVD;Cable length (m);Depth (m) MSL;Subsea (m);Elevation (m);Altitude (m);"
+    "Strekning (km);Strekning (cm);Strekning (mm);Vertikale Tiefe (m);Wassertiefe (m);Kabellänge (m);Höhe (m);"
+    "Vanndybde (m);Høyde (m);Profundidad vertical (m);Profundidad de agua (m);Elevación (m);Lâmina d'água (m);"
+    "Comprimento do cabo (m);Profondeur d'eau (m);Longueur de câble (m);Niveau de la mer (m);"
+    "Глубина по вертикали (м);Глубина воды (м);Длина кабеля (м);Высота над уровнем моря (м);垂深 (m);水深 (m);海拔 (m)"
+)
+"""Names of vertical depths, water, cables, heights and other units in the languages of `DEPTHS`."""
+
+
+def test_other_lengths_are_not_offered_as_measured_depths(tmp_path, laboratory):
+    """A well with all of them, and one column that may be the depth, which alone is offered."""
+    others = dict.fromkeys(OTHER_LENGTHS.split(";"), ("", METRES))
+    path = text_table(tmp_path / "WELL.csv", {**others, **deep("Strekning", METRES)})
+    [text] = [f.text for f in mc.survey(laboratory[1], path).findings if f.id == "no-path"]
+    assert '"md_m=Strekning"' in text
+    assert "It may be" not in text
 
 
 @pytest.mark.parametrize(

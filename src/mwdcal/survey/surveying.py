@@ -36,6 +36,7 @@ from mwdcal.files.depths import (
     counts_stations,
     is_depth,
     is_length,
+    is_other_length,
     unit_of_length,
 )
 from mwdcal.files.formats.columns import shown
@@ -361,9 +362,11 @@ def _with_depths_of(
 ) -> list[Finding]:
     """The findings; those that lack a measured depth name the `unused` columns that may be it.
 
-    Of these a column with a unit of length comes alone.
+    Of these a column with a unit of length comes alone; other lengths than a measured depth are not named.
     """
-    rising = [n for n in table.columns if shown(n) in unused and _may_be_depths(table, n)]
+    names = [n for n in table.columns if shown(n) in unused]
+    names = [n for n in names if not is_other_length(n, table.units.get(n, ""))]
+    rising = [n for n in names if _may_be_depths(table, n)]
     rising = [n for n in rising if unit_of_length(n, table.units.get(n, ""))] or rising
     listed = f" It may be {' or '.join(map(shown, rising))}." if rising[1:] else ""
     return [
