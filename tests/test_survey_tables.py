@@ -362,6 +362,8 @@ def test_numbers_of_surveys_named_as_depths_raise_a_question(tmp_path, laborator
         texts = {f.id: f.text for f in mc.survey(laboratory[1], path, column=column).findings}
         assert ("depths-count" in texts) is asks
         assert not asks or '"md_m=Strekning"' in texts["depths-count"]
+    path = text_table(tmp_path / "WELL.csv", deep("Depth (m)", np.arange(count) + 1.0))
+    assert "depths-count" in {f.id for f in mc.survey(laboratory[1], path).findings}
 
 
 @pytest.mark.parametrize(
@@ -382,6 +384,30 @@ def test_a_length_of_hole_is_the_measured_depth_where_nothing_else_may_be(
     path = text_table(tmp_path / "WELL.csv", {**table, **more})
     well = mc.survey(laboratory[1], path)
     assert (None if well.path is None else pytest.approx(well.path.md[-1])) == end
+
+
+@pytest.mark.parametrize("name", ["Hole length (m)", "Strekning"])
+@pytest.mark.parametrize("cell", ["", "x"])
+def test_a_cell_without_a_number_does_not_lose_the_column_of_depths(
+    tmp_path, laboratory, name, cell
+):
+    """A blank leaves its station out of the path; text is refused by its place, as in every column of depths."""
+    table = {
+        each: [*map(repr, map(float, cells))] for each, (_, cells) in deep(name, METRES).items()
+    }
+    table[name][5] = cell
+    if name == "Strekning":
+        [text] = [f.text for f in mc.survey(laboratory[1], table).findings if f.id == "no-path"]
+        assert '"md_m=Strekning"' in text
+    elif cell:
+        with pytest.raises(
+            InputError, match=r"column 'Hole length \(m\)': expected a number; got 'x'"
+        ):
+            mc.survey(laboratory[1], table)
+    else:
+        well = mc.survey(laboratory[1], table)
+        assert well.path.md[-1] == pytest.approx(METRES[-1])
+        assert np.isnan(well.columns["tvd_m"]).tolist() == [k == 5 for k in range(len(METRES))]
 
 
 OTHER_LENGTHS = (
