@@ -42,7 +42,7 @@ _OTHER_UNIT = re.compile(
     r"(?<![a-zа-я])([kcdm]m|(kilo|[cz]enti|de[cz]i|mill?i)met(re|er|ro)s?|k ?ft|inch(es)?|yd|yards?|fathoms?|[ксдм]м|"
     r"[千公分厘毫]米|公里)( ?(md|rt|rkb))?$"
 )
-"""Units of length at the end of a name that are none of depths."""
+"""Units of length at the end of a name in which mwdcal reads no measured depth."""
 _NO_DEPTH = re.compile(
     r"tvd|msl|verti[ck]al|cable|kabel|elev|altit|water|wasser|hohe|høyde|\b(vann|vatn|meer|sjø|вод|мор|кабел|"
     r"вертикал|высот|отметк|альтитуд)|\b((sub ?)?sea(bed|floor| ?level)?|hav(et)?|agua|acqua|eau|cabo|cavo|mare?|mer|"
