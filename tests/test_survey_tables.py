@@ -10,7 +10,7 @@ from msgspec.structs import replace
 import mwdcal as mc
 from cli_support import EXAMPLE, read_csv, refused
 from cli_support import mwdcal as cli
-from mwdcal.errors import FitError
+from mwdcal.errors import FitError, InputError
 from mwdcal.files.depths import is_depth
 from mwdcal.sensor.profile import TableFormat
 
@@ -296,6 +296,22 @@ def test_the_name_that_the_user_gives_comes_before_others(tmp_path, laboratory):
 
 
 @pytest.mark.parametrize(
+    ("name", "unit", "got"),
+    [("Pos (km)", "", "km"), ("Pos", "cm", "cm"), ("Pos_mm", "m", "mm"), ("井 (千米)", "", "千米")],
+)
+def test_a_measured_depth_in_another_unit_of_length_is_refused(
+    tmp_path, laboratory, name, unit, got
+):
+    """The user who knows better states the unit in the answer."""
+    path = text_table(tmp_path / "WELL.csv", deep(name, METRES, unit))
+    for column in "md_m", "md_ft":
+        with pytest.raises(InputError, match=f"the unit must be m, ft or usft; got '{got}'"):
+            mc.survey(laboratory[1], path, column={column: name})
+    well = mc.survey(laboratory[1], path, column={"md_m": f"{name} (m)"})
+    assert well.path.md == pytest.approx(METRES)
+
+
+@pytest.mark.parametrize(
     ("typed", "message"),
     [
         ("md_m=Foo", "there is no column 'Foo'; found"),
@@ -346,16 +362,19 @@ def test_numbers_of_surveys_named_as_depths_raise_a_question(tmp_path, laborator
         texts = {f.id: f.text for f in mc.survey(laboratory[1], path, column=column).findings}
         assert ("depths-count" in texts) is asks
         assert not asks or '"md_m=Strekning"' in texts["depths-count"]
+    path = text_table(tmp_path / "WELL.csv", deep("Depth (m)", np.arange(count) + 1.0))
+    assert "depths-count" in {f.id for f in mc.survey(laboratory[1], path).findings}
 
 
 @pytest.mark.parametrize(
     ("more", "end"),
     [
         ({"Hole length": ("m", METRES)}, METRES[-1]),
-        ({"Length (ft)": ("", METRES / 0.3048)}, METRES[-1]),
-        ({"Length (m)": ("", METRES), "Hole length (m)": ("", METRES)}, None),
-        ({"Length (m)": ("", np.full(len(METRES), 9.1))}, None),
-        ({"Length (m)": ("", METRES), "MD (m)": ("", METRES + 15)}, METRES[-1] + 15),
+        ({"Borehole length (ft)": ("", METRES / 0.3048)}, METRES[-1]),
+        ({"Well length (m)": ("", METRES)}, METRES[-1]),
+        ({"Well length (m)": ("", METRES), "Hole length (m)": ("", METRES)}, None),
+        ({"Hole length (m)": ("", np.full(len(METRES), 9.1))}, None),
+        ({"Hole length (m)": ("", METRES), "MD (m)": ("", METRES + 15)}, METRES[-1] + 15),
     ],
 )
 def test_a_length_of_hole_is_the_measured_depth_where_nothing_else_may_be(
@@ -365,6 +384,63 @@ def test_a_length_of_hole_is_the_measured_depth_where_nothing_else_may_be(
     path = text_table(tmp_path / "WELL.csv", {**table, **more})
     well = mc.survey(laboratory[1], path)
     assert (None if well.path is None else pytest.approx(well.path.md[-1])) == end
+
+
+@pytest.mark.parametrize("name", ["Hole length (m)", "Strekning"])
+@pytest.mark.parametrize("cell", ["", "x"])
+def test_a_cell_without_a_number_does_not_lose_the_column_of_depths(
+    tmp_path, laboratory, name, cell
+):
+    """A blank leaves its station out of the path; text is refused by its place, as in every column of depths."""
+    table = {
+        each: [*map(repr, map(float, cells))] for each, (_, cells) in deep(name, METRES).items()
+    }
+    table[name][5] = cell
+    if name == "Strekning":
+        [text] = [f.text for f in mc.survey(laboratory[1], table).findings if f.id == "no-path"]
+        assert '"md_m=Strekning"' in text
+    elif cell:
+        with pytest.raises(
+            InputError, match=r"column 'Hole length \(m\)': expected a number; got 'x'"
+        ):
+            mc.survey(laboratory[1], table)
+    else:
+        well = mc.survey(laboratory[1], table)
+        assert well.path.md[-1] == pytest.approx(METRES[-1])
+        assert np.isnan(well.columns["tvd_m"]).tolist() == [k == 5 for k in range(len(METRES))]
+
+
+OTHER_LENGTHS = (
+    "TVD (m);Water depth (m);Depth m TVD;Cable length (m);Depth (m) MSL;Subsea (m);Elevation (m);Altitude (m);"
+    "Strekning (km);Strekning (cm);Strekning (mm);Vertikale Tiefe (m);Wassertiefe (m);Kabellänge (m);Höhe (m);"
+    "Vanndybde (m);Høyde (m);Profundidad vertical (m);Profundidad de agua (m);Elevación (m);Lâmina d'água (m);"
+    "Comprimento do cabo (m);Profondeur d'eau (m);Longueur de câble (m);Niveau de la mer (m);"
+    "Глубина по вертикали (м);Глубина воды (м);Длина кабеля (м);Высота над уровнем моря (м);垂深 (m);水深 (m);海拔 (m)"
+)
+"""Names of vertical depths, water, cables, heights and other units in the languages of `DEPTHS`."""
+
+
+def test_other_lengths_are_not_offered_as_measured_depths(tmp_path, laboratory):
+    """A well with all of them, and one column that may be the depth, which alone is offered."""
+    others = dict.fromkeys(OTHER_LENGTHS.split(";"), ("", METRES))
+    path = text_table(tmp_path / "WELL.csv", {**others, **deep("Strekning", METRES)})
+    [text] = [f.text for f in mc.survey(laboratory[1], path).findings if f.id == "no-path"]
+    assert '"md_m=Strekning"' in text
+    assert "It may be" not in text
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [9 + 0.013 * np.arange(len(METRES)), np.where(np.arange(len(METRES)) < 6, 15.2, 15.6), METRES],
+    ids=["joints", "sensor", "hole"],
+)
+def test_a_bare_length_is_offered_and_not_taken(tmp_path, laboratory, cells):
+    """It may be that of a joint, or from bit to sensor."""
+    path = text_table(tmp_path / "WELL.csv", deep("Length (m)", cells))
+    well = mc.survey(laboratory[1], path)
+    assert well.path is None
+    [text] = [f.text for f in well.findings if f.id == "no-path"]
+    assert '"md_m=Length (m)"' in text
 
 
 def test_profile_of_surveys_names_survey(tmp_path):

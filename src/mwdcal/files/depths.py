@@ -30,12 +30,25 @@ _WORDS_OF_LENGTH = {
 }
 """Words for each unit of length."""
 _UNIT_OF_DEPTH = rf"({'|'.join(_WORDS_OF_LENGTH.values())})( ?(md|rt|rkb))?"
-_LENGTH = re.compile(rf"(((bore ?)?hole|drilled|along hole|ah) )?length ?{_UNIT_OF_DEPTH}")
+_LENGTH = re.compile(
+    rf"((bore ?)?hole|well( ?bore)?|drilled|along hole|ah) length ?{_UNIT_OF_DEPTH}"
+)
 _DEPTH = re.compile(rf"({_ALONG} )*{_NOUN}( {_ALONG})*( ?{_UNIT_OF_DEPTH})?")
 _AT_END = {
     unit: re.compile(rf"(?<![a-zа-я])({words})( ?(md|rt|rkb))?$")
     for unit, words in _WORDS_OF_LENGTH.items()
 }
+_OTHER_UNIT = re.compile(
+    r"(?<![a-zа-я])([kcdm]m|(kilo|[cz]enti|de[cz]i|mill?i)met(re|er|ro)s?|k ?ft|inch(es)?|yd|yards?|fathoms?|[ксдм]м|"
+    r"[千公分厘毫]米|公里)( ?(md|rt|rkb))?$"
+)
+"""Units of length at the end of a name in which mwdcal reads no measured depth."""
+_NO_DEPTH = re.compile(
+    r"tvd|msl|verti[ck]al|cable|kabel|elev|altit|water|wasser|hohe|høyde|\b(vann|vatn|meer|sjø|вод|мор|кабел|"
+    r"вертикал|высот|отметк|альтитуд)|\b((sub ?)?sea(bed|floor| ?level)?|hav(et)?|agua|acqua|eau|cabo|cavo|mare?|mer|"
+    r"cot[ae]|quota|altura|hauteur|altezza)\b|[垂水海高缆]"
+)
+"""Words of vertical depths, of depths of water, lengths of cable and heights, as `_plain` spells them."""
 
 
 def _plain(text: str) -> str:
@@ -55,12 +68,31 @@ def is_depth(name: str) -> bool:
 
 
 def is_length(name: str, unit: str = "") -> bool:
-    """Whether a column is called a length of hole, in a unit of length; it may be that of something else.
+    """Whether a column is called a length of hole, in a unit of length; a bare length may be that of anything.
 
-    >>> is_length("Hole length (m)"), is_length("Length", "ft"), is_length("Length"), is_length("Collar length (m)")
+    >>> is_length("Hole length (m)"), is_length("Well length", "ft"), is_length("Hole length"), is_length("Length (m)")
     (True, True, False, False)
     """
     return bool(_LENGTH.fullmatch(_plain(f"{name} {unit}")))
+
+
+def is_other_length(name: str, unit: str = "") -> bool:
+    """Whether a column is another length than a measured depth by its name, or in a unit that no depth has.
+
+    >>> [is_other_length(n) for n in ("TVD (m)", "Depth (m) MSL", "Seekabel, m", "Depth (km)", "Length (m)")]
+    [True, True, True, True, False]
+    """
+    return bool(_NO_DEPTH.search(_plain(name)) or other_unit_of_length(name, unit))
+
+
+def other_unit_of_length(*texts: str) -> str:
+    """The first unit of length at the end of texts in which no measured depth is read, else blank.
+
+    >>> other_unit_of_length("Pos (km)"), other_unit_of_length("Pos", "[mm]"), other_unit_of_length("Pos (m)")
+    ('km', 'mm', '')
+    """
+    ends = (_OTHER_UNIT.search(_plain(text)) for text in texts)
+    return next((end[1] for end in ends if end), "")
 
 
 def counts_stations(values: Array) -> bool:

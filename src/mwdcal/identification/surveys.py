@@ -14,7 +14,13 @@ from mwdcal.calibration.record import Calibration, Finding, with_checksum
 from mwdcal.errors import FitError, InputError, QuestionError, QuestionsError
 from mwdcal.files import runs
 from mwdcal.files.contract import CHANNELS, MAPPED, RAW
-from mwdcal.files.depths import MEASURED_DEPTHS, chosen_length, is_depth, unit_of_length
+from mwdcal.files.depths import (
+    MEASURED_DEPTHS,
+    chosen_length,
+    is_depth,
+    other_unit_of_length,
+    unit_of_length,
+)
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.layout import Layout
 from mwdcal.files.formats.table import Table
@@ -125,9 +131,13 @@ def _depth(table: Table, answers: Mapping[str, str]) -> tuple[dict[str, ColumnSo
     if not said:
         return {}, []
     name, unit = column_said(answers[said], table.columns, table.source)
-    stated = unit_of_length(unit, name, table.units.get(name, ""))
-    if unit and not unit_of_length(unit):
-        raise InputError(f"`column` {said}: the unit must be m, ft or usft; got {shown(unit)}.")
+    beside = table.units.get(name, "")
+    stated = unit_of_length(unit, name, beside)
+    other = other_unit_of_length(*([unit] if unit else [name, beside]))
+    if other or (unit and not unit_of_length(unit)):
+        raise InputError(
+            f"`column` {said}: the unit must be m, ft or usft; got {shown(other or unit)}."
+        )
     others = [each for each in table.columns if is_depth(each) and each != name]
     column = f"md_{chosen_length(stated, MEASURED_DEPTHS[said])}"
     return ({column: ColumnSource(name=name)} if name else {}), others

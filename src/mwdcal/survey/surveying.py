@@ -36,9 +36,10 @@ from mwdcal.files.depths import (
     counts_stations,
     is_depth,
     is_length,
+    is_other_length,
     unit_of_length,
 )
-from mwdcal.files.formats.columns import shown
+from mwdcal.files.formats.columns import looks_numeric, shown
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.profiles import setting
 from mwdcal.files.runs import away_from_stand, renamed, to_readings
@@ -145,7 +146,7 @@ def survey_readings(
         findings += of_another_day(reference, readings.metadata)
     referenced = readings if reference is None else with_reference(readings, reference)
     depth, factor = depth_column(named, length_unit or "m")
-    if md is not None and depth in MEASURED_DEPTHS and counts_stations(np.round(md / factor, 6)):
+    if md is not None and counts_stations(np.round(md / factor, 6)):
         findings.append(Finding(id="depths-count", text=DEPTHS_COUNT))
     return SurveyReadings(referenced, md, north, sources, findings, depth)
 
@@ -347,11 +348,18 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
 
 
 def _may_be_depths(table: Table, name: str) -> bool:
-    """Whether the numbers of a column never decrease, change, and do not count the stations."""
+    """Whether most cells of a column have numbers, which never decrease, change, and do not count the stations."""
+    cells = table.columns[name]
+    if isinstance(cells, list):
+        cells = [c if looks_numeric(c.strip(), table.decimal) else "" for c in cells]
     try:
-        values = numbers(table, name)
+        values = numbers(replace(table, columns={name: cells}), name)
     except InputError:
         return False
+    there = ~np.isnan(values)
+    if 2 * np.count_nonzero(there) <= there.size:
+        return False
+    values = values[there]
     steps = np.diff(values)
     return bool((steps >= 0).all() and steps.any()) and not counts_stations(values)
 
@@ -361,9 +369,11 @@ def _with_depths_of(
 ) -> list[Finding]:
     """The findings; those that lack a measured depth name the `unused` columns that may be it.
 
-    Of these a column with a unit of length comes alone.
+    Of these a column with a unit of length comes alone; other lengths than a measured depth are not named.
     """
-    rising = [n for n in table.columns if shown(n) in unused and _may_be_depths(table, n)]
+    names = [n for n in table.columns if shown(n) in unused]
+    names = [n for n in names if not is_other_length(n, table.units.get(n, ""))]
+    rising = [n for n in names if _may_be_depths(table, n)]
     rising = [n for n in rising if unit_of_length(n, table.units.get(n, ""))] or rising
     listed = f" It may be {' or '.join(map(shown, rising))}." if rising[1:] else ""
     return [
