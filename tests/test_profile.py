@@ -229,6 +229,32 @@ def test_what_is_open_is_asked_and_nothing_is_written(tmp_path, case):
     assert not (tmp_path / "tool.toml").exists()
 
 
+def test_vectors_of_a_master_tool_whose_gravity_differs_are_left_out_by_the_answer(tmp_path):
+    """Components that a second tool with its biases has measured: with the answer the profile is as without them."""
+    run, rng = changed(ref_gravity_g=None), np.random.default_rng(3)
+    inclination, azimuth, toolface, dip = (
+        np.radians(np.asarray(run[f"ref_{n}_deg"]))
+        for n in ("inclination", "azimuth", "toolface", "dip")
+    )
+    axes = tool_from_earth(inclination, azimuth, toolface)
+    down = np.broadcast_to([0.0, 0.0, 1.0], (48, 3))
+    field = np.stack([np.cos(dip), np.zeros(48), np.sin(dip)], -1) * 50_000.0
+    master = {}
+    for letter, unit, vector, bias in (("G", "g", down, 4e-3), ("B", "nT", field, 200.0)):
+        turned = np.einsum("nij,nj->ni", axes, vector) + rng.normal(0, bias, 3)
+        master |= {f"{letter}{a} reference ({unit})": turned[:, k] for k, a in enumerate("xyz")}
+    path = write_csv(tmp_path / "run.csv", {**run, **master})
+    with pytest.raises(
+        FitError, match=r"the gravity of 'Gx reference \(g\)', .* a tool has"
+    ) as asked:
+        propose_profile(path)
+    answer = asked.value.answers[0]
+    left = propose_profile(path, column=[value for _, value in answer.arguments])
+    plain = propose_profile(write_csv(tmp_path / "plain.csv", run))
+    assert not {each.name for each in left.profile.columns.values()} & {*master}
+    assert left.profile.accelerometer == plain.profile.accelerometer
+
+
 def test_a_comma_that_may_separate_thousands_is_asked(tmp_path):
     run = {k: np.round(v) for k, v in servo_run().items()}
     path = write_csv(tmp_path / "run.csv", {**run, **thousands(servo_run())}, delimiter=";")

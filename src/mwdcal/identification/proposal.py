@@ -28,7 +28,15 @@ from mwdcal.calibration.diagnosis.refusals import MOTION_RANGE
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import Answer, FitError, InputError, QuestionError, QuestionsError
-from mwdcal.files.contract import CHANNELS, MAPPED, RANGES, RAW, REFERENCES, units_of
+from mwdcal.files.contract import (
+    CHANNELS,
+    MAPPED,
+    RANGES,
+    RAW,
+    REFERENCE_VECTORS,
+    REFERENCES,
+    units_of,
+)
 from mwdcal.files.depths import is_depth
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, WORKBOOKS, looks_numeric, shown
@@ -1481,11 +1489,13 @@ def _check_gravity(readings: Readings, columns: Mapping[str, ColumnSource]) -> N
     gravity = readings.reference("gravity")
     if np.ptp(gravity) <= SAME_GRAVITY:
         return
-    name, apart = columns[REFERENCES["gravity"].column].name, 1000 * np.ptp(gravity)
+    column, apart = REFERENCES["gravity"].column, 1000 * np.ptp(gravity)
+    parts = [c for c in REFERENCE_VECTORS if c in columns and column not in columns]
+    names = ", ".join(shown(columns[c].name) for c in parts[:3] or [column])
     raise QuestionError(
-        f"{readings.source}: {shown(name)} differs between stations by {apart:.2g} mg, as no local gravity does: "
-        "the tool has measured it, and it is no reference.",
-        [Answer("leave it out", (("column", "ref_gravity_g="),))],
+        f"{readings.source}: {'the gravity of ' if parts else ''}{names} differs between stations by {apart:.2g} mg, "
+        f"as no local gravity does: {'a' if parts else 'the'} tool has measured it, and it is no reference.",
+        [Answer("leave it out", tuple(("column", f"{c}=") for c in parts or [column]))],
     )
 
 
@@ -1706,7 +1716,12 @@ def warmth_by_unit(proposal: Proposal) -> list[Finding]:
     where, source = proposal.where, (proposal.profile.columns or {}).get(WARMTH)
     units = dict(zip(where.names, where.units, strict=True)) if where else {}
     names = [source.name] if source else [each.strip("'") for each in proposal.unused]
-    warm = [n for n in names if warm_unit(n, units.get(n, "")) and not meaning(n, units.get(n, ""))]
+    warm = [
+        n
+        for n in names
+        if warm_unit(n, u := units.get(n, ""))
+        and not meaning(n.replace("°", ""), u.replace("°", ""))
+    ]
     text = (
         "{} is taken as the temperature of the tool, as the only column in a unit of temperatures. If it is not, say "
         "so: `column` 'temperature_c='."
