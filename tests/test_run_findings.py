@@ -418,7 +418,9 @@ def test_degrees_that_were_given_as_radians_are_named(name, sd):
     right = {**data.sd, **{each: np.full(48, ERROR / PER) for each in angles}}
     data = replace(data, known=known, settings="per-station")
     assert "stand-too-large" not in found(replace(data, sd=right))
-    text = found(replace(data, sd={**right, name: np.full(48, ERROR)}))["stand-too-large"]
+    wrong = replace(data, sd={**right, name: np.full(48, ERROR)})
+    assert "radians" not in found(wrong)["stand-too-large"]
+    text = found(replace(wrong, in_radians=angles))["stand-too-large"]
     assert f"{name} {ERROR * PER:.2g}° (errors 0.0" in text
     assert f"'{name}' is in radians: 0.02 rad is 1.15°" in text
     assert [each for each in angles if f"{each} 1.1°" in text] == [name]

@@ -10,7 +10,7 @@ import numpy as np
 
 from mwdcal.calibration.readings import TRIADS, Readings, fingerprints, group_numbers
 from mwdcal.errors import InputError
-from mwdcal.estimation.problem import WALKS
+from mwdcal.estimation.problem import ANGLES, WALKS
 from mwdcal.files import metadata as meta
 from mwdcal.files.contract import RAW_SPREAD, REFERENCES, TEMPERATURE, Range
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools, wrap
@@ -102,6 +102,7 @@ def readings(
         temperature=None if temperature is None else _temperature(temperature, shape),
         known=_known(references, shape),
         sd=_uncertainties(sd or {}, shape),
+        in_radians=tuple(name for name in ANGLES if name in (sd or {})),
         group=None if group is None else group_numbers(_labels("group", group, shape)),
         settings=settings,
         station=() if station is None else tuple(_labels("station", station, shape)),

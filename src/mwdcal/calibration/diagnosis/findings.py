@@ -148,6 +148,7 @@ FREE_DIRECTIONS = {
     "strength: ref_gravity_g or ref_field_nt",
 }
 
+_RADIANS = " In `sd` of Python '{name}' is in radians: {rad:.2g} rad is {deg:.3g}°. Degrees go to '{name}_deg'."
 REMARKS = {
     "noise": "{triad}: residuals are only {times:.2f} of what noise and stand as declared would leave (chance "
     "{small:.0e}): the declared noise is too large, readings are copies of each other, or they were corrected by a "
@@ -161,8 +162,7 @@ REMARKS = {
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
     'anew at each. If so, state settings = "per-station" in [stand] of the profile.',
     "stand-too-large": "the stated σ of the stand is far larger than its errors in this run: {angles}. Uncertainties "
-    "are too large. State it in degrees: as {first}_deg under [stand] of the profile, or in `sd` of Python, where "
-    "'{first}' is in radians: {rad:.2g} rad is {deg:.3g}°.",
+    "are too large: check it against the certificate.{radians}",
     "toolface-shared": "errors of the stand's toolface agree within each {by} (chance in noise {chance:.0e}), as if it "
     "had been set {groups} times in all. The stated uncertainty of toolface counts one error a station, and is too "
     "small: declare toolface_zero_deg = {size:.2g} under [stand] of the profile beside toolface_deg.",
@@ -428,9 +428,13 @@ def _coarse_stand(fitted: FittedRuns, stated: Mapping[str, Array]) -> Flag:
         degrees = ((n, np.degrees([stated[n][place], left[n][place]])) for n in each)
         return ", ".join(f"{n} {sd:.2g}° (errors {error:.2g}°)" for n, (sd, error) in degrees)
 
-    first = [ANGLES[index] for index in coarse.argmax(-1)]
-    sd = np.array([stated[name][place] for place, name in enumerate(first)])
-    words = {"angles": angles_of, "first": np.array(first), "rad": sd, "deg": np.degrees(sd)}
+    def radians_of(place: int) -> str:
+        each = [n for n, far in zip(ANGLES, coarse[place], strict=True) if far]
+        name = next((n for n in each if n in fitted.readings.in_radians), "")
+        sd = stated[name][place] if name else 0.0
+        return _RADIANS.format(name=name, rad=sd, deg=np.degrees(sd)) if name else ""
+
+    words = {"angles": angles_of, "radians": radians_of}
     return _remark("stand-too-large", np.any(coarse, -1), **words)
 
 
