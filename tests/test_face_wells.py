@@ -150,6 +150,27 @@ def without_files(document):
     return {key: value for key, value in document.items() if key not in ("output", "html")}
 
 
+def test_a_roll_test_of_arrays_without_the_stand_that_the_run_has_says_so():
+    run = mc.simulate([30, 60, 90, 120], 6, [0, 90], tool=4, seed=1)
+    roll = mc.simulate([45], 12, [60], tool=4, seed=3)
+    sd = {"inclination_deg": 0.02, "azimuth_deg": 0.05, "toolface_deg": 0.05}
+
+    def arrays(of, sd):
+        known = {
+            name: of.known[name] for name in ("inclination", "azimuth", "toolface", "field", "dip")
+        }
+        return mc.readings(
+            of.accelerometer, of.magnetometer, temperature=of.temperature, sd=sd, **known
+        )
+
+    cal, exact = (mc.calibrate(arrays(run, each)) for each in (sd, {}))
+    tests = [(cal, sd), (cal, {}), (exact, {})]
+    named = [
+        "stand-exact" in {f.id for f in mc.verify(c, arrays(roll, s)).findings} for c, s in tests
+    ]
+    assert named == [False, True, False]
+
+
 @pytest.mark.parametrize("msa", [False, True])
 @pytest.mark.usefixtures("without_pictures")
 def test_surveys_are_those_of_the_command(folder, here, tmp_path, msa):

@@ -649,6 +649,22 @@ def test_residuals_that_look_like_settings_name_the_one_to_check(angle):
     )
 
 
+def test_the_size_of_an_effect_is_in_the_unit_that_it_states():
+    """In a run without field strength per mille of the field: as many nT of 48,000 nT, by the same run with it."""
+    data = run(sd={}, inclinations=(5, 40, 75, 110, 145))
+    wrong = misread(on_directions(data, (0, 72, 144, 216, 288)), 0.5, slice(24, 36))
+    without = {name: values for name, values in wrong.known.items() if name != "field"}
+    sizes = [
+        found(each)["looks-like-settings"]
+        for each in (wrong, replace(wrong, known=without, magnetometer=wrong.magnetometer))
+    ]
+    [nt] = re.findall(r"and (\S+) nT rms", sizes[0])
+    [share] = re.findall(r"and (\S+) ‰ of the field rms", sizes[1])
+    field = np.median(wrong.known["field"])
+    assert float(share) == pytest.approx(float(nt) / field * 1e3, rel=0.3)
+    assert all("first state their 1σ" in text for text in sizes)
+
+
 @pytest.mark.parametrize("error", [0.0, 1.0])
 def test_two_directions_hide_a_wrong_angle_and_the_run_says_so(error):
     """At 45° and at 90° inclination, a quarter of a turn apart, the sensors take up a wrong setting."""

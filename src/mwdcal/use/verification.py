@@ -156,6 +156,9 @@ VERDICT_FINDINGS = {
     "contradicted": "the readings contradict references of the run that no limit judges: {what}. Check their unit, "
     "sign and place; or signs or axes of a sensor are exchanged. The verdict says nothing about it.",
     "no-roll-set": "no roll set: spreads were not judged.",
+    "stand-exact": "the angles of the stand count as exact in this test, and did not in the calibration's run: the "
+    "errors and the risk are too small by those of the stand. State their 1σ, by `sd` of mwdcal.readings or in "
+    "columns such as sd_ref_inclination_deg.",
     "harmonic-unseen": "{title}: the toolfaces hardly show the second harmonic of a turn, a difference of scales or a "
     "misalignment of x and y (four at right angles fit a mean and the first harmonic alone). The value may be "
     "too small by it: add toolfaces between them.",
@@ -517,6 +520,9 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
         yield _finding("not-judged", limits="; ".join(skipped))
     if not test.sets:
         yield _finding("no-roll-set")
+    exact = bool(readings.exact_angles[STAND_ANGLES_EXACT])
+    if exact and STAND_ANGLES_EXACT not in calibration.assumed_exact:
+        yield _finding("stand-exact")
     if calibration.temperature_c is None:
         yield _finding("no-temperature", tested=f", {tested} °C" if tested else "")
 

@@ -560,24 +560,25 @@ def _followed(fitted: FittedRuns) -> Iterator[Flag]:
 
 def _structure(fitted: FittedRuns) -> Iterator[Flag]:
     """The likely cause of residuals that are more than noise."""
-    unit = shown_in("field", fitted.readings.relative)[1]
     looked_at = np.flatnonzero(suspected(fitted.result, fitted.chances))
     for place, shown in fitted.shown(looked_at).items():
         for name in filter(partial(is_shown, shown), shown):
             column = name.startswith(COLUMN)
-            words = partial(_looks, fitted, name, unit)
+            words = partial(_looks, fitted, name)
             finding = MISFIT_BY_COLUMN if column else f"looks-like-{name}"
             yield Flag(finding, np.arange(fitted.count) == place, "{looks}", {"looks": words})
 
 
-def _looks(fitted: FittedRuns, name: str, unit: str, place: int) -> str:
+def _looks(fitted: FittedRuns, name: str, place: int) -> str:
     """An effect that the residuals of one run show, in words."""
     [effect] = (each for each in fitted.effects(place) if each.name == name)
-    looks = seen_as(effect, unit)
+    looks = seen_as(effect, fitted.alone(place)[0])
     if name == "settings":
         member = fitted.member(place)
         angle, stations = farthest_setting(member.problem, member.state, effect)
         looks += f" Check the {angle} of stations {_from_to(fitted, place, stations)} first."
+        exact = np.broadcast_to(fitted.readings.exact_angles[STAND_ANGLES_EXACT], fitted.count)
+        looks += f" {STATE_STAND}".rstrip() if exact[place] else ""
     return looks
 
 

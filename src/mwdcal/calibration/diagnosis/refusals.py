@@ -166,9 +166,8 @@ def _column(fitted: FittedRuns, place: int) -> str:
     """The column that the run does not use and that explains most of the residuals, in words."""
     if not fitted.readings.others:
         return ""
-    unit = shown_in("field", fitted.readings.relative)[1]
     named = [effect for effect in fitted.effects(place) if effect.name.startswith(COLUMN)]
-    return "".join(f" {described(effect, unit)}" for effect in named[:1])
+    return "".join(f" {described(effect, fitted.alone(place)[0])}" for effect in named[:1])
 
 
 REFUSAL_ENDINGS = {"culprit": _culprit, "axes": _axes, "column": _column}
@@ -722,7 +721,7 @@ def _unexplained_errors(fitted: FittedRuns, sound: Bools) -> Flag:
 
     def looks(place: int) -> str:
         first = fitted.effects(place)[:1]
-        return "".join(f" {described(each, shown_in('field', relative)[1])}" for each in first)
+        return "".join(f" {described(each, fitted.alone(place)[0])}" for each in first)
 
     return _refusal(fitted, "errors", flags, of=worst, looks=looks)
 

@@ -21,7 +21,14 @@ from mwdcal.calibration.automatic.courses import TRIED, f_test, steady_columns, 
 from mwdcal.calibration.diagnosis.plausibility import stations_to_reshoot
 from mwdcal.calibration.estimate import Fit, fewer_stations, without_stations
 from mwdcal.calibration.methods import ESTIMABLE, STAND_TURNS, acts_on
-from mwdcal.calibration.readings import HIGHEST, LEAST_TEMPERATURE_SPAN, TRIADS, highest_order
+from mwdcal.calibration.readings import (
+    HIGHEST,
+    LEAST_TEMPERATURE_SPAN,
+    TRIADS,
+    Readings,
+    highest_order,
+)
+from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import variance_scales
 from mwdcal.estimation.batch import kind_of, put, take
 from mwdcal.estimation.minimisers import closed_form, closed_form_drift, uncertain_stand
@@ -959,8 +966,8 @@ def farthest_setting(problem: Problem, state: State, effect: Effect) -> tuple[st
     return angles[angle].removesuffix("-zero"), np.flatnonzero(sets[:, number])
 
 
-def described(effect: Effect, unit: str) -> str:
-    """An effect in words; `unit` is that of the magnetometer."""
+def described(effect: Effect, readings: Readings) -> str:
+    """An effect in words, in the units of a run."""
     if effect.name.startswith(COLUMN):
         return COLUMN_EXPLAINS.format(name=effect.name.removeprefix(COLUMN), effect=effect)
     triad, _, kind = effect.name.partition("-")
@@ -973,7 +980,10 @@ def described(effect: Effect, unit: str) -> str:
     elif effect.name == "tilt":
         size = f"{np.degrees(np.linalg.norm(effect.values)):.2g}°"
     else:
-        parts = [(1e3, "mg"), (1.0, unit)][: len(effect.size)]
+        factor, unit = shown_in("field", readings.relative)
+        if readings.relative and readings.magnetometer is not None:
+            factor /= np.linalg.norm(readings.magnetometer, axis=-1).mean()
+        parts = [(1e3, "mg"), (factor, unit)][: len(effect.size)]
         each = [f"{s * f:.2g} {u} rms" for s, (f, u) in zip(effect.size, parts, strict=True)]
         size = " and ".join(each[TRIADS.index(triad) :][:1] if of_triad else each)
     whose = f"{triad}: the" if of_triad else "The"
