@@ -407,3 +407,13 @@ def test_uncal_channels_are_taken_beside_cal_ones(tmp_path):
     names += [f"{n.split()[0]} cal {n.split()[1]}" for n in NAMES[3:9]]
     corrected = [[*row, *(v * 1.01 for v in row[3:9])] for row in rows]
     assert same(taken(written(tmp_path / "run.csv", lines_of(corrected, names))), rows)
+
+
+def test_which_of_two_rows_at_one_attitude_counts_is_asked_though_the_readings_fit_one(tmp_path):
+    rows = stations()
+    bad = [*rows[5][:3], *(v + 0.3 for v in rows[5][3:9]), rows[5][9]]
+    both = [[k, *row] for k, row in enumerate([*rows[:5], bad, *rows[5:]])]
+    path = written(tmp_path / "run.csv", lines_of(both, ["Pos", *NAMES]))
+    with pytest.raises(mwdcal.FitError, match="Which counts"):
+        taken(path)
+    assert same(taken(path, leave_out={"Pos": ["5"]}), rows)

@@ -147,7 +147,7 @@ def test_links_between_pages_lead_to_files():
 
 
 def test_no_message_points_to_a_file_of_the_repository():
-    """After `pip install` there is none: messages name a page by its title, as in (docs, 'Glossary')."""
+    """`pip install` brings no repository: messages name a page by its title, as in (docs, 'Glossary')."""
     for path in (ROOT / "src").rglob("*.py"):
         nodes = [*ast.walk(ast.parse(path.read_text("utf-8")))]
         docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}

@@ -97,7 +97,7 @@ _OF_STATUS = re.compile(
 _AFFIRMED = {"y", "yes", "true", "1", "x", "ja", "j", "si", "s", "sim", "oui", "o", "да", "д", "是"}
 _DENIED = {"n", "no", "false", "0", "nein", "nei", "nao", "non", "нет", "н", "否"}
 _ENTRIES = re.compile(r"[,;|]\s*(?=\w{1,6}\s*=)")
-"""What stands between the entries of a legend."""
+"""The separator before the next entry of a legend."""
 MARKS_NAMED = 8
 """Rows that a sentence names."""
 _MARK_NUMBERS = frozenset("0123456789+-−eE.,:;/ ")

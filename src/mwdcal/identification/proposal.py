@@ -102,6 +102,8 @@ _BEYOND = 0.1
 """How far a number of nines lies beyond all others that stands for none, as a share of their range."""
 _OFF_NORM = 0.15
 """By how much the norm of its row differs from the others' where it lies among them, as a share."""
+_IS_REJECTED = "Is that a rejected station?"
+"""The question on a row with a remark."""
 _FEW_WORDS = 2
 """Words of a mark at most; more are a remark, which may speak of another row."""
 
@@ -115,7 +117,7 @@ def question_on_mark(table: Table, name: str, cell: str, rows: Sequence[int]) ->
     few = len(cell.split()) <= _FEW_WORDS
     more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
     return QuestionError(
-        f"{table.source}: {place(table, rows[0])}{more}: {shown(name)} says {shown(cell)}. Is that a rejected station?",
+        f"{table.source}: {place(table, rows[0])}{more}: {shown(name)} says {shown(cell)}. {_IS_REJECTED}",
         answers if few else answers[::-1],
     )
 
@@ -453,10 +455,11 @@ def _questions_of(error: QuestionError | QuestionsError) -> Sequence[QuestionErr
 
 
 def _doubtful_rows(error: QuestionError | QuestionsError) -> dict[str, str]:
-    """What questions say of rows with a remark that may reject them, by COLUMN=TEXT."""
+    """Rows with a remark that may reject them: the words of each question, by COLUMN=TEXT."""
     return {
-        text: each.text.partition(": ")[2].partition(". Is that")[0]
+        text: each.text.partition(": ")[2].partition(f". {_IS_REJECTED}")[0]
         for each in _questions_of(error)
+        if _IS_REJECTED in each.text
         for answer in each.answers
         for option, text in answer.arguments
         if option == "keep"
@@ -508,7 +511,7 @@ def _says_no_reading(cell: str) -> bool:
 
 
 _NINES = re.compile(r"[-−]?9{3,}([.,](0+|9+|25))?")
-"""A number by which loggers say that there is none."""
+"""A number that loggers write for a missing reading."""
 _TWO_LETTERS = re.compile(r"(?!(?i:[nsewo]\W[nsewo]))[^\W\d_]\W[^\W\d_]\W?")
 """Two letters in place of a number, that are no points of the compass: S/L, k.A."""
 _OF_THE_PLACE = tuple(REFERENCES[name].column for name in STATED_REFERENCES)

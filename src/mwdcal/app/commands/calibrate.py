@@ -115,7 +115,7 @@ def command(
 def _judged(
     calibration: Calibration, rolltest: Readings, limits: str, files: tuple[Path, Path]
 ) -> _Judgement:
-    """The verdict of a roll test, its text on screen with what to do next, and why there is none.
+    """The verdict of a roll test, its text on screen with what to do next, and the error without a verdict.
 
     `files` of calibration and roll test.
     """
