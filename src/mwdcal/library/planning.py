@@ -51,7 +51,7 @@ class PlanResult(Result):
     @property
     def table(self) -> Table:
         """The plan as the table of a run without readings."""
-        return self.plans[0].plan
+        return self.plans[0].stated
 
     @property
     def columns(self) -> dict[str, AnyArray]:
@@ -146,7 +146,7 @@ def plan(
     the fewest that give it, with `measured` the best to add to a run that exists. `criterion` says what `stations`
     are best in: "D", all parameters together; "A", each of them; "I", the angles. `serial` is the tool's, for the
     sheet; by default that of the calibration or run behind the plan. `options` and `choices` are those
-    of `calibrate`. Where the plan does not state the place, it is that of the run of a calibration given as `tool`.
+    of `calibrate`. Where the plan does not state the place, it is that of a calibration given as `tool`.
 
     Units: degrees for accuracies and for `reach` of the stand, degrees per second for its `speed`; `settle` in
     seconds from the end of a move to the reading, `soak` in minutes to reach a temperature.
@@ -176,7 +176,9 @@ def plan(
     stand = Stand(speed, settle, soak, ends)
     tables = [plan_table(cast(PlanSource, each)) for each in several]
     done = None if measured is None else _measured(measured, profile)
-    if isinstance(tool, Calibration) and done is None:
+    if isinstance(tool, Calibration) and done:
+        done = at_place_of(done, tool)
+    elif isinstance(tool, Calibration):
         usual = "candidates" if accuracy_deg or stations else "twenty-four-state"
         tables = tables or [at_temperature_of(plan_table(usual), tool)]
         tables = [at_place_of(each, tool) for each in tables]

@@ -57,6 +57,7 @@ from mwdcal.planning.plans import (
     load_plan,
     soak_numbers,
     taken,
+    without_estimates,
 )
 from mwdcal.sensor.profile import PRACTICES, Profile
 
@@ -229,6 +230,7 @@ class Planned:
     `measured` already before the plan's. No plan of fewer than `bound` stations gives the wanted accuracy, if one is;
     `search` says what the search has to say, `assumed` which noise the profile does not state. `set_anew` works out
     the calibration on a stand that is set at every station, `compared` the inclinations of a best plan, if few.
+    `tool` is the calibration whose profile, noise and place it takes, if it takes any.
     """
 
     plan: Table
@@ -245,6 +247,7 @@ class Planned:
     search: list[Finding] = field(default_factory=list)
     assumed: list[Finding] = field(default_factory=list)
     compared: Callable[[], Levels | None] = lambda: None
+    tool: Calibration | None = None
 
     @classmethod
     def of(
@@ -273,6 +276,11 @@ class Planned:
     def per_station(self) -> Calibration | None:
         """The calibration on a stand that is set at every station, where nobody says how often it is."""
         return self.set_anew() if self.calibration.settings == ASSUMED_PRACTICE else None
+
+    @property
+    def stated(self) -> Table:
+        """The plan as its run states it: without the field and dip that the calibration of the tool estimated."""
+        return without_estimates(self.plan, self.tool) if self.tool else self.plan
 
     @property
     def inclinations(self) -> Array:
@@ -313,11 +321,11 @@ class Planned:
 
 
 def with_tool(planned: Planned, tool: object) -> Planned:
-    """A plan that says so if its calibration will lack temperature terms that the tool, a calibration, has."""
+    """A plan with its `tool`, a calibration, which says so if it will lack temperature terms that this has."""
     if not isinstance(tool, Calibration):
         return planned
     lost = temperature_terms_lost(tool, planned.calibration)
-    return replace(planned, assumed=[*planned.assumed, *lost])
+    return replace(planned, assumed=[*planned.assumed, *lost], tool=tool)
 
 
 def judged(

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.options import ASSUMED, ASSUMED_PRACTICE
+from mwdcal.calibration.readings import SIMULATED, is_simulated, serial_of
 from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Undetermined
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import accuracy_at, typical_accuracy
@@ -19,7 +20,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
 from mwdcal.planning.planned import Planned, station_names
-from mwdcal.planning.plans import attitudes, soak_numbers, soak_temperatures
+from mwdcal.planning.plans import attitudes, place_of, soak_numbers, soak_temperatures
 from mwdcal.presentation.calibration import PLACE
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import files_written, quantity
@@ -264,7 +265,7 @@ def screen(
 ) -> str:
     """The result for people."""
     summaries = [facts(each) for each in plans]
-    head = f"{plans[0].calibration.profile.name}   expected of a nominal tool, nothing measured"
+    head = f"{plans[0].calibration.profile.name}   {_basis(plans[0])}"
     blocks = [
         one_line(head),
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
@@ -279,8 +280,17 @@ def screen(
     return "\n\n".join(blocks)
 
 
+def _basis(planned: Planned) -> str:
+    """The tool of which a plan expects its results."""
+    if (tool := planned.tool) is None:
+        return "expected of a nominal tool, nothing measured"
+    whose = f"tool {serial}" if (serial := serial_of(tool.tool)) else "the tool"
+    label = f"   {SIMULATED}" if is_simulated(tool.tool) else ""
+    return f"expected of {whose} from its calibration of {tool.day}{label}"
+
+
 def _assumed(planned: Planned) -> list[str]:
-    """Field, dip and gravity of the prediction as a line: field or dip that the plan does not state, if any."""
+    """Field, dip and gravity of the prediction as lines: field or dip that nothing states, if any."""
     if not planned.calibration.has_field:
         return []
     gravity, field, dip = (float(values[0]) for values in planned_earth(planned.plan))
@@ -288,8 +298,21 @@ def _assumed(planned: Planned) -> list[str]:
     blank = [word for name, word in words.items() if _is_blank(planned.plan, name)]
     if blank:
         return [f"the plan does not state the place; assumed: {', '.join(blank)}"]
-    stated = [] if _is_blank(planned.plan, "gravity") else [f"gravity {gravity:.5g} g"]
-    return [f"place: {', '.join([*words.values(), *stated])}"]
+    if not _is_blank(planned.plan, "gravity"):
+        words["gravity"] = f"gravity {gravity:.5g} g"
+    by_source: dict[str, list[str]] = {}
+    for name, word in words.items():
+        by_source.setdefault(_source(planned, name), []).append(word)
+    return [f"place{source}: {', '.join(some)}" for source, some in by_source.items()]
+
+
+def _source(planned: Planned, name: str) -> str:
+    """Who gives a constant of the place; blank: the plan."""
+    tool, column = planned.tool, REFERENCES[name].column
+    if tool is None or np.any(planned.plan.columns[column] != place_of(tool).get(column)):
+        return ""
+    estimated = any(constant.name == name for constant in tool.constants)
+    return ", estimated by the calibration" if estimated else ", from the calibration"
 
 
 def _temperatures(plans: Sequence[Planned]) -> list[str]:
@@ -461,7 +484,8 @@ def render(plans: Sequence[Planned], serial: str = "") -> str:
         summary=summaries[0],
         banner=_banner(first),
         findings=[*left_undetermined(first.calibration), *first.findings],
-        simulated=False,
+        simulated=first.tool is not None and is_simulated(first.tool.tool),
+        basis="calibration" if first.tool else "profile",
         place=_place(first),
         titles=titles,
         channels=_channels(first.calibration),
@@ -506,9 +530,9 @@ def _channels(calibration: Calibration) -> list[str]:
 
 def _place(planned: Planned) -> list[tuple[str, str]]:
     """Gravity, field and dip of the place with their units; blank where the plan does not state them."""
-    rows = []
+    rows, stated = [], planned.stated.columns
     for name, word in (("gravity", "Gravity, g"), ("field", "Field, nT"), ("dip", "Dip, °")):
-        values = np.unique(np.asarray(planned.plan.columns.get(REFERENCES[name].column, ()), float))
+        values = np.unique(np.asarray(stated.get(REFERENCES[name].column, ()), float))
         rows.append((word, f"{values[0]:.6g}" if len(values) == 1 else ""))
     return rows
 
@@ -532,7 +556,7 @@ def _banner(planned: Planned) -> dict[str, str]:
     )
     return banner(
         "attention" if free or planned.findings else "open",
-        "Planned – nothing measured",
+        f"Planned – {_basis(planned)}",
         headline,
         after,
     )

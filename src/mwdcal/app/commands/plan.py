@@ -69,7 +69,7 @@ from mwdcal.app.messages import print_result
 )
 @options.tool(
     help="Tool profile: a name that mwdcal list profiles shows, or a TOML file. Or a calibration (JSON): its profile, "
-    "the place of its run, and the noise that it estimated if the profile states none."
+    "its field, dip and gravity if the plan states none, and the noise that it estimated if the profile states none."
 )
 @click.option(
     "--serial",
@@ -97,7 +97,7 @@ def command(
 ) -> None:  # fmt: skip
     """Predict a calibration from planned stations: uncertainty, rank, accuracy, hours at the stand.
 
-    Nothing is measured: a nominal tool with the noise and the stand of the profile.
+    Nothing is measured: a nominal tool with the noise and the stand of the profile or calibration.
 
     \b
     Example: mwdcal plan --stations 24 --tool servo -o plan.csv --report sheet.html
