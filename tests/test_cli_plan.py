@@ -247,7 +247,9 @@ def test_a_plan_says_its_temperatures_and_what_it_lacks_of_the_calibration(tmp_p
     assert "\nplanned at 25 °C; the calibration will be good for 20…30 °C\n" in ran.out
     assert ran.out.count("D-efficiency: how close the plan is to the best possible one") == 1
     assert "30.0…70.0 °C, and this plan gives none" in ran.err
-    assert ran.out.startswith("example servo tool   expected of the tool from its calibration of 20")
+    assert ran.out.startswith(
+        "example servo tool   expected of the tool from its calibration of 20"
+    )
     levels = re.search(r"temperature_c = \[.*?\]", ran.err)[0]
     assert levels == "temperature_c = [30, 50, 70]"
     plan = tmp_path / "mine.toml"

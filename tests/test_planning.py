@@ -320,6 +320,11 @@ def test_seconds_of_a_session():
     # 90° at 2°/s, then 20° (azimuth the short way: 10°), three readings after 10 s each, one soak
     assert session_seconds(stations, np.zeros(3, int), STAND) == 45 + 10 + 30 + 3600
     assert session_seconds(stations, np.array([0, 0, 1]), STAND) == 45 + 10 + 30 + 7200
+    usual = replace(
+        STAND, soak_minutes=None
+    )  # one temperature needs no oven; of two each is a soak of 90 min
+    assert session_seconds(stations, np.zeros(3, int), usual) == 45 + 10 + 30
+    assert session_seconds(stations, np.array([0, 0, 1]), usual) == 45 + 10 + 30 + 2 * 5400
 
 
 def test_an_axis_with_ends_goes_back_the_long_way():
@@ -746,7 +751,9 @@ def test_the_screen_says_what_is_assumed_and_how_long_the_soak_is(tmp_path):
                     "azimuth_deg = [0, 120]\ntoolface_deg = [0, 90, 180, 270]\n", "utf-8")  # fmt: skip
     shown = mwdcal("plan", "--plan", plan, "--tool", "servo", "--soak", 90).out
     assert "the plan does not state the place; assumed: field 48,000 nT\n" in shown
-    assert re.search(r"of which soak \(--soak\) +1\.5 h", shown)
+    assert re.search(r"of which soak \(no oven: --soak 0\) +1\.5 h", shown)
+    without = mwdcal("plan", "--plan", plan, "--tool", "servo").out
+    assert re.search(r"of which soak \(--soak\) +0\.0 h", without)
     assert "SIMULATED" not in shown
     assert "the plan does not state the place; assumed: field 48,000 nT, dip 63°\n" in mwdcal(
         "plan", "--plan", "six-state", "--tool", "servo"
@@ -832,13 +839,15 @@ def test_a_plan_lists_the_inclinations_in_reach_and_the_time_of_a_station(tmp_pa
     assert document["inclinations_deg"] == [5.0, 30.0, 60.0, 90.0]
     assert {len(sd) for sd in document["accuracy_by_inclination_deg"].values()} == {4}
     assert mwdcal(*line, "--json").json["inclinations_deg"][-1] == 120.0
+    by_hand = document["session_hours"] + 12 * 2 / 60
     seconds = 3600 * (document["session_hours"] - document["soak_hours"]) / 12
-    assert f"{seconds:.0f} s a station and 1.5 h of soak" in sheet.read_text("utf-8")
+    assert f"{seconds:.0f} s a station; {by_hand:.1f} h by hand" in sheet.read_text("utf-8")
+    assert document["soak_hours"] == 0.0
     said = " ".join(mwdcal(*line, *reach).out.split())
     assert f"per station (--speed, --settle) {seconds:.0f} s" in said
-    by_hand = document["session_hours"] + 12 * 2 / 60
     assert f"by hand, 2 min a station more {by_hand:.1f} h" in said
-    assert f"h of soak; {by_hand:.1f} h by hand" in sheet.read_text("utf-8")
+    mwdcal(*line, *reach, "--soak", 90, "--report", sheet)
+    assert f"and 1.5 h of soak; {by_hand + 1.5:.1f} h by hand" in sheet.read_text("utf-8")
 
 
 @pytest.mark.parametrize(("stations", "whole"), [(24, True), (25, False)])

@@ -133,7 +133,7 @@ def plan(
     criterion: Literal["D", "A", "I"] = "I",
     speed: float = 5.0,
     settle: float = 30.0,
-    soak: float = 90.0,
+    soak: float | None = None,
     serial: str = "",
     options: Options | None = None,
     progress: Callable[[int, int], None] = silent,
@@ -149,7 +149,8 @@ def plan(
     of `calibrate`. Where the plan does not state the place, it is that of a calibration given as `tool`.
 
     Units: degrees for accuracies and for `reach` of the stand, degrees per second for its `speed`; `settle` in
-    seconds from the end of a move to the reading, `soak` in minutes to reach a temperature.
+    seconds from the end of a move to the reading, `soak` in minutes to reach a temperature, by default 90,
+    and 0 where a plan has one temperature.
 
     Raises:
         InputError: a plan, profile or keyword that cannot be read, or a profile without scale and noise.

@@ -65,18 +65,23 @@ AT_ENDS_WITHIN = 1e-6
 """A setting so little beyond what the stand reaches is within it, degrees."""
 
 
+USUAL_SOAK = 90.0
+"""Minutes until a tool has the temperature of its next soak."""
+
+
 @dataclass(frozen=True)
 class Stand:
     """How fast a stand is: its axes move at the same time.
 
     `degrees_per_second` of an axis, `settle_seconds` between the end of a move and the reading,
-    `soak_minutes` until the tool has the temperature of the next soak. `reach`: the least and the largest
+    `soak_minutes` until the tool has the temperature of the next soak; None: `USUAL_SOAK`, and no soak at all where
+    the session has one temperature. `reach`: the least and the largest
     setting by angle, degrees; azimuth and toolface without one turn round and round.
     """
 
     degrees_per_second: float = 5.0
     settle_seconds: float = 30.0
-    soak_minutes: float = 90.0
+    soak_minutes: float | None = None
     reach: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -88,7 +93,10 @@ class Stand:
             raise InputError(
                 f"`speed` must be more than 0 degrees per second; got {self.degrees_per_second:g}."
             )
-        for name, value in (("settle", self.settle_seconds), ("soak", self.soak_minutes)):
+        for name, value in (
+            ("settle", self.settle_seconds),
+            ("soak", self.soak_minutes or 0.0),
+        ):
             if not 0 <= value < np.inf:
                 raise InputError(f"`{name}` must be a time of 0 or more; got {value:g}.")
         for name, (low, high) in self.reach.items():
@@ -144,7 +152,9 @@ def session_seconds(attitude: Array, soak: Ints, stand: Stand) -> float:
 
 def soak_seconds(soak: Ints, stand: Stand) -> float:
     """Duration of all soaks of a session."""
-    return 60.0 * stand.soak_minutes * (1 + int(np.count_nonzero(np.diff(soak))))
+    changes = int(np.count_nonzero(np.diff(soak)))
+    usual = USUAL_SOAK if changes else 0.0
+    return 60.0 * (usual if stand.soak_minutes is None else stand.soak_minutes) * (1 + changes)
 
 
 def measuring_order(attitude: Array, soak: Ints) -> Ints:

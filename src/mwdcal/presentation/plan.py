@@ -357,10 +357,11 @@ def _is_blank(plan: Table, name: str) -> bool:
 
 def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
     """The results of the plans, a plan in each column."""
+    option = "no oven: --soak 0" if any(each.soak_hours for each in facts) else "--soak"
     lines = [
         ["stations", *(str(each.stations) for each in facts)],
         ["at the stand, driven", *(f"{each.session_hours:.1f} h" for each in facts)],
-        ["of which soak (--soak)", *(f"{each.soak_hours:.1f} h" for each in facts)],
+        [f"of which soak ({option})", *(f"{each.soak_hours:.1f} h" for each in facts)],
         ["per station (--speed, --settle)", *(f"{_seconds_each(each):.0f} s" for each in facts)],
         [
             f"by hand, {BY_HAND / 60:g} min a station more",
@@ -545,9 +546,10 @@ def _banner(planned: Planned) -> dict[str, str]:
         for name, sd in summary.accuracy_deg.items()
         if sd is not None
     )
+    soak = f" and {summary.soak_hours:.1f} h of soak" if summary.soak_hours else ""
     headline = (
         f"{plural(summary.stations, 'station')} – about {summary.session_hours:.1f} h at a driven stand, "
-        f"{_seconds_each(summary):.0f} s a station and {summary.soak_hours:.1f} h of soak; "
+        f"{_seconds_each(summary):.0f} s a station{soak}; "
         f"{_by_hand(summary):.1f} h by hand"
     )
     after = (
