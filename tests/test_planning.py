@@ -760,6 +760,31 @@ def test_the_screen_says_what_is_assumed_and_how_long_the_soak_is(tmp_path):
     ).out  # fmt: skip
 
 
+FAR = "Inclinations up to {}°. If your stand reaches less, add --reach inclination_deg=0:120 to"
+
+
+@pytest.mark.parametrize(
+    ("line", "most"),
+    [
+        (("--stations", 8), 175),
+        (("--stations", 8, "--reach", "toolface_deg=0:330"), 175),
+        (("--plan", "moosavi-12", "--plan", "twenty-four-state"), 180),
+        (("--plan", "moosavi-12"), None),
+        (("--stations", 8, "--reach", "inclination_deg=0:120"), None),
+        (("--stations", 8, "--reach", "inclination_deg=0:180"), None),
+    ],
+)
+def test_a_plan_beyond_many_stands_names_the_option_for_them(line, most):
+    """What it names does keep to 120°."""
+    shown = mwdcal("plan", *line, "--tool", "servo").out
+    assert shown.count("If your stand reaches less") == (most is not None)
+    assert most is None or FAR.format(most) in shown
+    if "inclination_deg=0:120" in line:
+        rows = re.findall(r"^\d+ +25 +(\S+) ", shown, re.MULTILINE)
+        assert len(rows) == 8
+        assert max(map(float, rows)) <= 120
+
+
 def test_a_profile_without_noise_is_planned_with_that_of_a_servo_instrument(tmp_path):
     """The same as with the noise of the built-in servo tool, 0.1 mg and 15 nT, stated in the profile's raw units."""
     path, plan = tmp_path / "p.toml", ("plan", "--plan", "moosavi-12", "--json", "--tool")

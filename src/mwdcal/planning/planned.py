@@ -666,8 +666,8 @@ def _check_reached(plan: Table, stand: Stand) -> None:
             names = station_names(plan)
             out = listed([names[k] for k in np.flatnonzero(~reached)], OUT_NAMED)
             raise InputError(
-                f"{plan.source}: the stand reaches {name} {low:g}:{high:g}°, and station {out} lie outside. Leave "
-                "them out, or widen `reach`."
+                f"{plan.source}: the stand reaches {name} {low:g}:{high:g}°, and station {out} lie outside. Let "
+                "`stations` choose others, leave them out, or widen `reach`."
             )
 
 

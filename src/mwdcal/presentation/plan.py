@@ -15,6 +15,7 @@ from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Un
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import accuracy_at, typical_accuracy
 from mwdcal.errors import InputError
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
@@ -56,6 +57,8 @@ GOOD_FOR = "the calibration will be good for {:.0f}…{:.0f} °C"
 """The temperatures that a plan gives."""
 EFFICIENCY = "D-efficiency: how close the plan is to the best possible one of as many stations, which has 100 %"
 """The meaning of the word in the table."""
+FAR_INCLINATION = 150.0
+"""Many stands that are turned by hand reach no larger inclination, degrees."""
 BY_HAND = 120.0
 """Seconds that a person takes for a station beyond move and settling: to set each scale, and to read and note."""
 
@@ -271,7 +274,7 @@ def screen(
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
     ]
     lines = [*_assumed(plans[0]), *_temperatures(plans), *_practice(summaries)]
-    lines += [*_inclinations(plans[0]), EFFICIENCY]
+    lines += [*_inclinations(plans[0]), *_far(plans), EFFICIENCY]
     blocks += filter(None, ["\n".join(lines)])
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
@@ -345,6 +348,17 @@ def _inclinations(planned: Planned) -> list[str]:
         f"Only {used} of {len(levels.offered)} inclinations to choose from: stations tell most where readings differ "
         f"most. As many stations evenly at all {len(levels.offered)} have {levels.cost:.2f} times the 1σ of {aim}."
         f"{more}"
+    ]
+
+
+def _far(plans: Sequence[Planned]) -> list[str]:
+    """The option for a stand that turns less far than the plans, as a line, if they go far and nobody has used it."""
+    most = max(float(attitudes(each.plan)[:, 0].max()) for each in plans)
+    if most <= FAR_INCLINATION or ANGLES[0] in plans[0].stand.reach:
+        return []
+    return [
+        f"Inclinations up to {most:g}°. If your stand reaches less, add --reach inclination_deg=0:120 to --stations "
+        "or --accuracy."
     ]
 
 
