@@ -24,7 +24,7 @@ from mwdcal.planning.planned import Planned, station_names
 from mwdcal.planning.plans import attitudes, place_of, soak_numbers, soak_temperatures
 from mwdcal.presentation.calibration import PLACE
 from mwdcal.presentation.envelope import json_document
-from mwdcal.presentation.numbers import files_written, quantity
+from mwdcal.presentation.numbers import capital, files_written, quantity
 from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.stations import MOST_LINES
 from mwdcal.presentation.text import one_line, plural, table
@@ -55,7 +55,7 @@ WITHOUT_VERTICAL = "not at 0°: at the vertical, azimuth and toolface are undefi
 
 GOOD_FOR = "the calibration will be good for {:.0f}…{:.0f} °C"
 """The temperatures that a plan gives."""
-EFFICIENCY = "D-efficiency: how close the plan is to the best possible one of as many stations, which has 100 %"
+EFFICIENCY = "how close the plan is to the best possible one of as many stations, which has 100 %"
 """The meaning of the word in the table."""
 FAR_INCLINATION = 150.0
 """Many stands that are turned by hand reach no larger inclination, degrees."""
@@ -269,12 +269,13 @@ def screen(
     """The result for people."""
     summaries = [facts(each) for each in plans]
     head = f"{plans[0].calibration.profile.name}   {_basis(plans[0])}"
+    head += f"   {SIMULATED}" * _simulated(plans[0])
     blocks = [
         one_line(head),
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
     ]
     lines = [*_assumed(plans[0]), *_temperatures(plans), *_practice(summaries)]
-    lines += [*_inclinations(plans[0]), *_far(plans), EFFICIENCY]
+    lines += [*_inclinations(plans[0]), *_far(plans), f"D-efficiency: {EFFICIENCY}"]
     blocks += filter(None, ["\n".join(lines)])
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
@@ -288,8 +289,12 @@ def _basis(planned: Planned) -> str:
     if (tool := planned.tool) is None:
         return "expected of a nominal tool, nothing measured"
     whose = f"tool {serial}" if (serial := serial_of(tool.tool)) else "the tool"
-    label = f"   {SIMULATED}" if is_simulated(tool.tool) else ""
-    return f"expected of {whose} from its calibration of {tool.day}{label}"
+    return f"expected of {whose} from its calibration of {tool.day}"
+
+
+def _simulated(planned: Planned) -> bool:
+    """Whether a plan rests on a simulated calibration."""
+    return planned.tool is not None and is_simulated(planned.tool.tool)
 
 
 def _assumed(planned: Planned) -> list[str]:
@@ -499,7 +504,7 @@ def render(plans: Sequence[Planned], serial: str = "") -> str:
         summary=summaries[0],
         banner=_banner(first),
         findings=[*left_undetermined(first.calibration), *first.findings],
-        simulated=first.tool is not None and is_simulated(first.tool.tool),
+        simulated=_simulated(first),
         basis="calibration" if first.tool else "profile",
         place=_place(first),
         titles=titles,
@@ -511,13 +516,20 @@ def render(plans: Sequence[Planned], serial: str = "") -> str:
         asks_settings=not first.calibration.profile.stand.practice,
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
-        inclinations=_inclinations(first),
+        lines=_sheet_lines(first),
         accuracy=accuracy_rows(summaries[0]),
         detectable=detectable_rows(summaries[0]),
         detectable_titles=DETECTABLE_TITLES,
         coverage=draw_coverage(plans),
         curves=draw_accuracy(plans),
     )
+
+
+def _sheet_lines(planned: Planned) -> list[str]:
+    """The place, the temperatures and the efficiency of a plan, and why it has few inclinations, as sentences."""
+    efficiency = f"D-efficiency, at least {100 * planned.efficiency:.0f} %: {EFFICIENCY}"
+    lines = [*_assumed(planned), *_temperatures([planned]), efficiency]
+    return [*(f"{capital(line)}." for line in lines), *_inclinations(planned)]
 
 
 def _sheet(plan: Table) -> tuple[list[str], list[tuple[list[str], bool]]]:
