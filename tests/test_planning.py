@@ -804,6 +804,18 @@ def test_a_profile_without_noise_is_planned_with_that_of_a_servo_instrument(tmp_
         assert sd == pytest.approx(known["accuracy_deg"][angle], rel=1e-6)
 
 
+@pytest.mark.parametrize("many", [(), ("--repeat", 2, "--workers", 1)])
+def test_a_simulation_says_the_assumed_noise_in_the_words_of_the_plan(tmp_path, many):
+    planned = mwdcal("plan", "--tool", "sap6", "--plan", "moosavi-12")
+    [line] = [each for each in planned.err.splitlines() if "the noise of" in each]
+    command = ("simulate", *many, "--plan", "moosavi-12", "-o", tmp_path / "out.csv", "--tool")
+    assert mwdcal(*command, "sap6").err.splitlines() == [line.replace("moosavi-12: ", "")]
+    assert [each["id"] for each in mwdcal(*command, "sap6", "--json").json["findings"]] == [
+        "noise-assumed"
+    ]
+    assert mwdcal(*command, "servo").err == ""
+
+
 @pytest.mark.parametrize("suffix", ["csv", "xlsx"])
 def test_a_plan_file_names_the_tool_and_so_does_its_calibration(tmp_path, suffix):
     sheet, page = tmp_path / f"plan.{suffix}", tmp_path / "sheet.html"
