@@ -165,7 +165,6 @@ def plan(
     """
     from mwdcal.planning import planned
     from mwdcal.planning.planned import Stand
-    from mwdcal.planning.plans import at_place_of, at_temperature_of
 
     several = plan if isinstance(plan, list | tuple) else [] if plan is None else [plan]
     if len(several) > 1 and (accuracy_deg or stations or measured is not None):
@@ -177,12 +176,9 @@ def plan(
     stand = Stand(speed, settle, soak, ends)
     tables = [plan_table(cast(PlanSource, each)) for each in several]
     done = None if measured is None else _measured(measured, profile)
-    if isinstance(tool, Calibration) and done:
-        done = at_place_of(done, tool)
-    elif isinstance(tool, Calibration):
+    if isinstance(tool, Calibration):
         usual = "candidates" if accuracy_deg or stations else "twenty-four-state"
-        tables = tables or [at_temperature_of(plan_table(usual), tool)]
-        tables = [at_place_of(each, tool) for each in tables]
+        tables, done = _placed(tables, done, tool, usual)
     candidates = tables[0] if tables else None
     if accuracy_deg:
         wanted = accuracy_deg, profile, chosen, stand, done, stations
@@ -198,6 +194,18 @@ def plan(
     result = [planned.with_tool(each, tool) for each in result]
     digests = {"profile": digest, "measured": done.digest if done else ""}
     return PlanResult(result, digests, serial=serial or _serial(tool, done or result[0].plan))
+
+
+def _placed(
+    tables: list[Table], done: Table | None, tool: Calibration, usual: str
+) -> tuple[list[Table], Table | None]:
+    """Plans, or else stations measured already, at the place of a calibration; without either the `usual` plan."""
+    from mwdcal.planning.plans import at_place_of, at_temperature_of
+
+    if done:
+        return tables, at_place_of(done, tool)
+    tables = tables or [at_temperature_of(plan_table(usual), tool)]
+    return [at_place_of(each, tool) for each in tables], None
 
 
 def _serial(tool: object, run: Table) -> str:
