@@ -247,6 +247,9 @@ def test_a_plan_says_its_temperatures_and_what_it_lacks_of_the_calibration(tmp_p
     assert "\nplanned at 25 °C; the calibration will be good for 20…30 °C\n" in ran.out
     assert ran.out.count("D-efficiency: how close the plan is to the best possible one") == 1
     assert "30.0…70.0 °C, and this plan gives none" in ran.err
+    assert ran.out.startswith(
+        "example servo tool   expected of the tool from its calibration of 20"
+    )
     levels = re.search(r"temperature_c = \[.*?\]", ran.err)[0]
     assert levels == "temperature_c = [30, 50, 70]"
     plan = tmp_path / "mine.toml"
@@ -254,8 +257,15 @@ def test_a_plan_says_its_temperatures_and_what_it_lacks_of_the_calibration(tmp_p
         "inclination_deg = [30, 90, 150]\nazimuth_deg = [0, 90]\ntoolface_deg = [0, 90, 180, 270]"
     )
     plan.write_text(f'name = "mine"\n{levels}\n[[stations]]\n{stations}\n', "utf-8")
-    again = mwdcal("plan", "--tool", cal, "--plan", plan, "--order", 1)
+    sheet = tmp_path / "sheet.html"
+    again = mwdcal("plan", "--tool", cal, "--plan", plan, "--order", 1, "--report", sheet)
     assert "\nplanned at 30, 50, 70 °C; the calibration will be good for 29…71 °C\n" in again.out
+    page = sheet.read_text("utf-8")
+    assert "<br>Planned at 30, 50, 70 °C; the calibration will be good for 29…71 °C.<br>" in page
+    [share] = re.findall(r"\nD-efficiency, at least +(\d+ %)\n", again.out)
+    assert f"<br>D-efficiency, at least {share}: how close the plan is to the best" in page
+    assert "Planned – expected of the tool from its calibration of 20" in page
+    assert "<br>Place, from the calibration: field " in page
     assert "gives none" not in again.err
     single = calibrated(tmp_path)
     assert "gives none" not in mwdcal("plan", "--tool", single).err

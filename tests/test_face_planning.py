@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import typing
 from dataclasses import replace
 
@@ -168,9 +169,15 @@ def test_the_tool_of_a_calibration(tmp_path):
     )
 
 
+def run_at_70():
+    """A simulated run of 24 stations at a dip of 70°."""
+    attitudes = mwdcal.plan("servo").columns
+    return mwdcal.simulate({**attitudes, "ref_dip_deg": np.full(24, 70.0)}, seed=3)
+
+
 def test_a_plan_is_at_the_place_of_the_calibration_unless_it_states_one():
-    """The plan states no value that the run only estimated, such as the dip here."""
-    run = mwdcal.simulate("twenty-four-state", seed=3)
+    """The plan predicts at the dip that the run estimated, near the true 70°; it states it as no reference."""
+    run = run_at_70()
     known = {"field": np.full(len(run), 51_000.0), "gravity": np.full(len(run), 0.998)}
     angles = {name: run.known[name] for name in ("inclination", "azimuth", "toolface")}
     place = mwdcal.calibrate(replace(run, known=angles | known))
@@ -179,9 +186,31 @@ def test_a_plan_is_at_the_place_of_the_calibration_unless_it_states_one():
         assert set(columns["ref_field_nt"]) == {51_000.0}
         assert set(columns["ref_gravity_g"]) == {0.998}
         assert np.isnan(columns.get("ref_dip_deg", [np.nan])).all()
-        assert "assumed: dip 63°" in made.summary()
+        shown = made.summary()
+        assert "\nplace, from the calibration: field 51,000 nT, gravity 0.998 g\n" in shown
+        dip = float(re.search(r"place, estimated by the calibration: dip (\S+)°\n", shown)[1])
+        assert abs(dip - 70) < 0.1
     stated = {**mwdcal.plan(place).columns, "ref_field_nt": np.full(24, 45_000.0)}
-    assert set(mwdcal.plan(place, plan=stated).columns["ref_field_nt"]) == {45_000.0}
+    other = mwdcal.plan(place, plan=stated)
+    assert set(other.columns["ref_field_nt"]) == {45_000.0}
+    assert "\nplace: field 45,000 nT\nplace, estimated by" in other.summary()
+
+
+@pytest.mark.parametrize("run", [None, "measured"])
+def test_a_plan_is_as_accurate_as_at_the_dip_that_the_calibration_estimated(run):
+    """As one of the same profile that states this dip."""
+    bare = {name: cells for name, cells in run_at_70().columns.items() if name != "ref_dip_deg"}
+    place = mwdcal.calibrate(bare, "servo")
+    [dip] = [constant.value for constant in place.constants]
+    stated = {**bare, "ref_dip_deg": np.full(24, dip)}
+    if run:
+        made = mwdcal.plan(place, measured=bare, stations=2)
+        same = mwdcal.plan("servo", measured=stated, stations=2)
+        assert same.accuracy_deg != mwdcal.plan("servo", measured=bare, stations=2).accuracy_deg
+    else:
+        made, same = mwdcal.plan(place), mwdcal.plan("servo", plan=stated)
+        assert same.accuracy_deg != mwdcal.plan("servo").accuracy_deg
+    assert made.accuracy_deg == pytest.approx(same.accuracy_deg, rel=1e-6)
 
 
 def test_what_has_a_profile_is_taken_for_it():

@@ -320,6 +320,11 @@ def test_seconds_of_a_session():
     # 90° at 2°/s, then 20° (azimuth the short way: 10°), three readings after 10 s each, one soak
     assert session_seconds(stations, np.zeros(3, int), STAND) == 45 + 10 + 30 + 3600
     assert session_seconds(stations, np.array([0, 0, 1]), STAND) == 45 + 10 + 30 + 7200
+    usual = replace(
+        STAND, soak_minutes=None
+    )  # one temperature needs no oven; of two each is a soak of 90 min
+    assert session_seconds(stations, np.zeros(3, int), usual) == 45 + 10 + 30
+    assert session_seconds(stations, np.array([0, 0, 1]), usual) == 45 + 10 + 30 + 2 * 5400
 
 
 def test_an_axis_with_ends_goes_back_the_long_way():
@@ -746,11 +751,38 @@ def test_the_screen_says_what_is_assumed_and_how_long_the_soak_is(tmp_path):
                     "azimuth_deg = [0, 120]\ntoolface_deg = [0, 90, 180, 270]\n", "utf-8")  # fmt: skip
     shown = mwdcal("plan", "--plan", plan, "--tool", "servo", "--soak", 90).out
     assert "the plan does not state the place; assumed: field 48,000 nT\n" in shown
-    assert re.search(r"of which soak \(--soak\) +1\.5 h", shown)
+    assert re.search(r"of which soak \(no oven: --soak 0\) +1\.5 h", shown)
+    without = mwdcal("plan", "--plan", plan, "--tool", "servo").out
+    assert re.search(r"of which soak \(--soak\) +0\.0 h", without)
     assert "SIMULATED" not in shown
     assert "the plan does not state the place; assumed: field 48,000 nT, dip 63°\n" in mwdcal(
         "plan", "--plan", "six-state", "--tool", "servo"
     ).out  # fmt: skip
+
+
+FAR = "Inclinations up to {}°. If your stand reaches less, add --reach inclination_deg=0:120 to"
+
+
+@pytest.mark.parametrize(
+    ("line", "most"),
+    [
+        (("--stations", 8), 175),
+        (("--stations", 8, "--reach", "toolface_deg=0:330"), 175),
+        (("--plan", "moosavi-12", "--plan", "twenty-four-state"), 180),
+        (("--plan", "moosavi-12"), None),
+        (("--stations", 8, "--reach", "inclination_deg=0:120"), None),
+        (("--stations", 8, "--reach", "inclination_deg=0:180"), None),
+    ],
+)
+def test_a_plan_beyond_many_stands_names_the_option_for_them(line, most):
+    """What it names does keep to 120°."""
+    shown = mwdcal("plan", *line, "--tool", "servo").out
+    assert shown.count("If your stand reaches less") == (most is not None)
+    assert most is None or FAR.format(most) in shown
+    if "inclination_deg=0:120" in line:
+        rows = re.findall(r"^\d+ +25 +(\S+) ", shown, re.MULTILINE)
+        assert len(rows) == 8
+        assert max(map(float, rows)) <= 120
 
 
 def test_a_profile_without_noise_is_planned_with_that_of_a_servo_instrument(tmp_path):
@@ -770,6 +802,18 @@ def test_a_profile_without_noise_is_planned_with_that_of_a_servo_instrument(tmp_
     assert "noise-assumed" not in {each["id"] for each in known["findings"]}
     for angle, sd in assumed.json["accuracy_deg"].items():
         assert sd == pytest.approx(known["accuracy_deg"][angle], rel=1e-6)
+
+
+@pytest.mark.parametrize("many", [(), ("--repeat", 2, "--workers", 1)])
+def test_a_simulation_says_the_assumed_noise_in_the_words_of_the_plan(tmp_path, many):
+    planned = mwdcal("plan", "--tool", "sap6", "--plan", "moosavi-12")
+    [line] = [each for each in planned.err.splitlines() if "the noise of" in each]
+    command = ("simulate", *many, "--plan", "moosavi-12", "-o", tmp_path / "out.csv", "--tool")
+    assert mwdcal(*command, "sap6").err.splitlines() == [line.replace("moosavi-12: ", "")]
+    assert [each["id"] for each in mwdcal(*command, "sap6", "--json").json["findings"]] == [
+        "noise-assumed"
+    ]
+    assert mwdcal(*command, "servo").err == ""
 
 
 @pytest.mark.parametrize("suffix", ["csv", "xlsx"])
@@ -832,13 +876,15 @@ def test_a_plan_lists_the_inclinations_in_reach_and_the_time_of_a_station(tmp_pa
     assert document["inclinations_deg"] == [5.0, 30.0, 60.0, 90.0]
     assert {len(sd) for sd in document["accuracy_by_inclination_deg"].values()} == {4}
     assert mwdcal(*line, "--json").json["inclinations_deg"][-1] == 120.0
+    by_hand = document["session_hours"] + 12 * 2 / 60
     seconds = 3600 * (document["session_hours"] - document["soak_hours"]) / 12
-    assert f"{seconds:.0f} s a station and 1.5 h of soak" in sheet.read_text("utf-8")
+    assert f"{seconds:.0f} s a station; {by_hand:.1f} h by hand" in sheet.read_text("utf-8")
+    assert document["soak_hours"] == 0.0
     said = " ".join(mwdcal(*line, *reach).out.split())
     assert f"per station (--speed, --settle) {seconds:.0f} s" in said
-    by_hand = document["session_hours"] + 12 * 2 / 60
     assert f"by hand, 2 min a station more {by_hand:.1f} h" in said
-    assert f"h of soak; {by_hand:.1f} h by hand" in sheet.read_text("utf-8")
+    mwdcal(*line, *reach, "--soak", 90, "--report", sheet)
+    assert f"and 1.5 h of soak; {by_hand + 1.5:.1f} h by hand" in sheet.read_text("utf-8")
 
 
 @pytest.mark.parametrize(("stations", "whole"), [(24, True), (25, False)])

@@ -51,7 +51,7 @@ class PlanResult(Result):
     @property
     def table(self) -> Table:
         """The plan as the table of a run without readings."""
-        return self.plans[0].plan
+        return self.plans[0].stated
 
     @property
     def columns(self) -> dict[str, AnyArray]:
@@ -133,7 +133,7 @@ def plan(
     criterion: Literal["D", "A", "I"] = "I",
     speed: float = 5.0,
     settle: float = 30.0,
-    soak: float = 90.0,
+    soak: float | None = None,
     serial: str = "",
     options: Options | None = None,
     progress: Callable[[int, int], None] = silent,
@@ -146,10 +146,11 @@ def plan(
     the fewest that give it, with `measured` the best to add to a run that exists. `criterion` says what `stations`
     are best in: "D", all parameters together; "A", each of them; "I", the angles. `serial` is the tool's, for the
     sheet; by default that of the calibration or run behind the plan. `options` and `choices` are those
-    of `calibrate`. Where the plan does not state the place, it is that of the run of a calibration given as `tool`.
+    of `calibrate`. Where the plan does not state the place, it is that of a calibration given as `tool`.
 
     Units: degrees for accuracies and for `reach` of the stand, degrees per second for its `speed`; `settle` in
-    seconds from the end of a move to the reading, `soak` in minutes to reach a temperature.
+    seconds from the end of a move to the reading, `soak` in minutes to reach a temperature, by default 90,
+    and 0 where a plan has one temperature.
 
     Raises:
         InputError: a plan, profile or keyword that cannot be read, or a profile without scale and noise.
@@ -164,7 +165,6 @@ def plan(
     """
     from mwdcal.planning import planned
     from mwdcal.planning.planned import Stand
-    from mwdcal.planning.plans import at_place_of, at_temperature_of
 
     several = plan if isinstance(plan, list | tuple) else [] if plan is None else [plan]
     if len(several) > 1 and (accuracy_deg or stations or measured is not None):
@@ -176,10 +176,9 @@ def plan(
     stand = Stand(speed, settle, soak, ends)
     tables = [plan_table(cast(PlanSource, each)) for each in several]
     done = None if measured is None else _measured(measured, profile)
-    if isinstance(tool, Calibration) and done is None:
+    if isinstance(tool, Calibration):
         usual = "candidates" if accuracy_deg or stations else "twenty-four-state"
-        tables = tables or [at_temperature_of(plan_table(usual), tool)]
-        tables = [at_place_of(each, tool) for each in tables]
+        tables, done = _placed(tables, done, tool, usual)
     candidates = tables[0] if tables else None
     if accuracy_deg:
         wanted = accuracy_deg, profile, chosen, stand, done, stations
@@ -195,6 +194,18 @@ def plan(
     result = [planned.with_tool(each, tool) for each in result]
     digests = {"profile": digest, "measured": done.digest if done else ""}
     return PlanResult(result, digests, serial=serial or _serial(tool, done or result[0].plan))
+
+
+def _placed(
+    tables: list[Table], done: Table | None, tool: Calibration, usual: str
+) -> tuple[list[Table], Table | None]:
+    """Plans, or else stations measured already, at the place of a calibration; without either the `usual` plan."""
+    from mwdcal.planning.plans import at_place_of, at_temperature_of
+
+    if done:
+        return tables, at_place_of(done, tool)
+    tables = tables or [at_temperature_of(plan_table(usual), tool)]
+    return [at_place_of(each, tool) for each in tables], None
 
 
 def _serial(tool: object, run: Table) -> str:

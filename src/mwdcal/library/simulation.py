@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
 
 import numpy as np
+from msgspec import convert
 
 from mwdcal.calibration.options import Options, Orders, SeedlessFitChoices
 from mwdcal.calibration.readings import Readings, serial_of
-from mwdcal.calibration.record import Calibration
+from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import runs
 from mwdcal.files.formats.table import Table
@@ -67,6 +68,11 @@ class SimulatedReadings(Readings, Result):
         self.truth.update(output=str(output), truth=str(facts or ""))
         atomic.write_all([(output, rendered), (facts, to_json(self.truth) + "\n")])
 
+    @property
+    def findings(self) -> list[Finding]:
+        """The noise that is assumed, where the profile states none."""
+        return convert(self.truth.get("findings", []), list[Finding])
+
     def _text(self) -> str:
         from mwdcal.presentation.simulation import screen
 
@@ -84,7 +90,13 @@ class RepeatedProcedure(Result):
     rows: Tools
     repetition: Repetition
     digests: Mapping[str, str]
+    assumed: list[Finding] = field(default_factory=list)
     files: dict[str, Path] = field(default_factory=dict)
+
+    @property
+    def findings(self) -> list[Finding]:
+        """The noise that is assumed, where the profile states none."""
+        return self.assumed
 
     @property
     def columns(self) -> Tools:
@@ -134,6 +146,7 @@ class RepeatedProcedure(Result):
         facts = {
             "seed": procedure.seed, "order": procedure.order, "repetition": self.repetition,
             "reference_temperature_c": procedure.calibrating.profile.reference_temperature_c,
+            "findings": self.findings,
         }  # fmt: skip
         return document(procedure.calibrating, facts, self.digests, None, **self.files)
 
@@ -352,6 +365,7 @@ def _run(
 ) -> SimulatedReadings:
     """One run of one tool: see `simulate`."""
     from mwdcal.planning import session as sessions
+    from mwdcal.planning.expected import assumed_noise
     from mwdcal.presentation.simulation import document
 
     scene, wanted = _Scene.of(plan, tool, calibration, effects, seed), _order(Options(order=order))
@@ -362,6 +376,7 @@ def _run(
     serial = (serial_of(scene.record.tool) if scene.record else None) or f"SIM-{seed}"
     table, facts = sessions.simulated_run(session, true, seed, rng, serial)
     facts |= sessions.tool_facts(true, session.profile, scene.record)
+    facts["findings"] = assumed_noise(scene.profile)
     readings, profile = runs.read_run(table, session.profile)
     read = {each.name: getattr(readings, each.name) for each in fields(Readings)}
     read |= {"profile": profile, "profile_sha256": scene.digests.get("profile", "")}
@@ -388,6 +403,7 @@ def _repeated(
 ) -> RepeatedProcedure:
     """A whole procedure for many tools: see `simulate`."""
     from mwdcal.files.limits import load_limits
+    from mwdcal.planning.expected import assumed_noise
     from mwdcal.planning.procedure import Procedure, joined, summarised
 
     check_whole("repeat", repeat, 1)
@@ -405,4 +421,4 @@ def _repeated(
     columns = joined(done)
     shown = summarised(columns, procedure.judged, procedure.guard)
     digests = {**scene.digests, "rolltest": test.digest, "limits": digest}
-    return RepeatedProcedure(procedure, columns, shown, digests)
+    return RepeatedProcedure(procedure, columns, shown, digests, assumed_noise(scene.profile))

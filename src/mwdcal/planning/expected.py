@@ -44,7 +44,7 @@ def _with_noise(profile: Profile, kind: str) -> Profile:
 
 
 def assumed_noise(profile: Profile) -> list[Finding]:
-    """That a plan takes the noise of a servo instrument, where the profile does not state it."""
+    """That a plan or a simulation takes the noise of a servo instrument, where the profile does not state it."""
     kinds = [k for k in channels(profile.has_magnetometer) if getattr(profile, k).noise is None]
     sizes = [
         f"{1e3 * USUAL_NOISE[k]:g} mg" if k == TRIADS[0] else f"{USUAL_NOISE[k]:g} nT"

@@ -57,6 +57,7 @@ from mwdcal.planning.plans import (
     load_plan,
     soak_numbers,
     taken,
+    without_estimates,
 )
 from mwdcal.sensor.profile import PRACTICES, Profile
 
@@ -64,18 +65,23 @@ AT_ENDS_WITHIN = 1e-6
 """A setting so little beyond what the stand reaches is within it, degrees."""
 
 
+USUAL_SOAK = 90.0
+"""Minutes until a tool has the temperature of its next soak."""
+
+
 @dataclass(frozen=True)
 class Stand:
     """How fast a stand is: its axes move at the same time.
 
     `degrees_per_second` of an axis, `settle_seconds` between the end of a move and the reading,
-    `soak_minutes` until the tool has the temperature of the next soak. `reach`: the least and the largest
+    `soak_minutes` until the tool has the temperature of the next soak; None: `USUAL_SOAK`, and no soak at all where
+    the session has one temperature. `reach`: the least and the largest
     setting by angle, degrees; azimuth and toolface without one turn round and round.
     """
 
     degrees_per_second: float = 5.0
     settle_seconds: float = 30.0
-    soak_minutes: float = 90.0
+    soak_minutes: float | None = None
     reach: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -87,7 +93,10 @@ class Stand:
             raise InputError(
                 f"`speed` must be more than 0 degrees per second; got {self.degrees_per_second:g}."
             )
-        for name, value in (("settle", self.settle_seconds), ("soak", self.soak_minutes)):
+        for name, value in (
+            ("settle", self.settle_seconds),
+            ("soak", self.soak_minutes or 0.0),
+        ):
             if not 0 <= value < np.inf:
                 raise InputError(f"`{name}` must be a time of 0 or more; got {value:g}.")
         for name, (low, high) in self.reach.items():
@@ -143,7 +152,9 @@ def session_seconds(attitude: Array, soak: Ints, stand: Stand) -> float:
 
 def soak_seconds(soak: Ints, stand: Stand) -> float:
     """Duration of all soaks of a session."""
-    return 60.0 * stand.soak_minutes * (1 + int(np.count_nonzero(np.diff(soak))))
+    changes = int(np.count_nonzero(np.diff(soak)))
+    usual = USUAL_SOAK if changes else 0.0
+    return 60.0 * (usual if stand.soak_minutes is None else stand.soak_minutes) * (1 + changes)
 
 
 def measuring_order(attitude: Array, soak: Ints) -> Ints:
@@ -229,6 +240,7 @@ class Planned:
     `measured` already before the plan's. No plan of fewer than `bound` stations gives the wanted accuracy, if one is;
     `search` says what the search has to say, `assumed` which noise the profile does not state. `set_anew` works out
     the calibration on a stand that is set at every station, `compared` the inclinations of a best plan, if few.
+    `tool` is the calibration whose profile, noise and place it takes, if it takes any.
     """
 
     plan: Table
@@ -245,6 +257,7 @@ class Planned:
     search: list[Finding] = field(default_factory=list)
     assumed: list[Finding] = field(default_factory=list)
     compared: Callable[[], Levels | None] = lambda: None
+    tool: Calibration | None = None
 
     @classmethod
     def of(
@@ -273,6 +286,11 @@ class Planned:
     def per_station(self) -> Calibration | None:
         """The calibration on a stand that is set at every station, where nobody says how often it is."""
         return self.set_anew() if self.calibration.settings == ASSUMED_PRACTICE else None
+
+    @property
+    def stated(self) -> Table:
+        """The plan as its run states it: without the field and dip that the calibration of the tool estimated."""
+        return without_estimates(self.plan, self.tool) if self.tool else self.plan
 
     @property
     def inclinations(self) -> Array:
@@ -313,11 +331,11 @@ class Planned:
 
 
 def with_tool(planned: Planned, tool: object) -> Planned:
-    """A plan that says so if its calibration will lack temperature terms that the tool, a calibration, has."""
+    """A plan with its `tool`, a calibration, which says so if it will lack temperature terms that this has."""
     if not isinstance(tool, Calibration):
         return planned
     lost = temperature_terms_lost(tool, planned.calibration)
-    return replace(planned, assumed=[*planned.assumed, *lost])
+    return replace(planned, assumed=[*planned.assumed, *lost], tool=tool)
 
 
 def judged(
@@ -648,8 +666,8 @@ def _check_reached(plan: Table, stand: Stand) -> None:
             names = station_names(plan)
             out = listed([names[k] for k in np.flatnonzero(~reached)], OUT_NAMED)
             raise InputError(
-                f"{plan.source}: the stand reaches {name} {low:g}:{high:g}°, and station {out} lie outside. Leave "
-                "them out, or widen `reach`."
+                f"{plan.source}: the stand reaches {name} {low:g}:{high:g}°, and station {out} lie outside. Let "
+                "`stations` choose others, leave them out, or widen `reach`."
             )
 
 

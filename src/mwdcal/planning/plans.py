@@ -250,18 +250,33 @@ def at_place(plan: Table, other: Table) -> Table:
     return replace(plan, columns={**plan.columns, **place})
 
 
-def at_place_of(plan: Table, calibration: Calibration) -> Table:
-    """A plan with the gravity, field and dip that the run of a calibration stated, where the plan states none."""
-    estimated = {constant.name for constant in calibration.constants}
+def place_of(calibration: Calibration) -> dict[str, float]:
+    """Gravity, field and dip of a calibration, stated or estimated, by column; no gravity that it assumed."""
     place = {}
     for name in CONSTANTS:
         column = REFERENCES[name].column
         value = calibration.earth.get("field" if name == "field" else column.removeprefix("ref_"))
-        unknown = name in estimated or (name == "gravity" and unknown_gravity(calibration))
-        given = np.asarray(plan.columns.get(column, ()), float)
-        if value is not None and not unknown and np.isnan(given).all():
-            place[column] = np.full(plan.count, value)
+        if value is not None and not (name == "gravity" and unknown_gravity(calibration)):
+            place[column] = value
+    return place
+
+
+def at_place_of(plan: Table, calibration: Calibration) -> Table:
+    """A plan with the gravity, field and dip of a calibration where the plan states none."""
+    place = {
+        column: np.full(plan.count, value)
+        for column, value in place_of(calibration).items()
+        if np.isnan(np.asarray(plan.columns.get(column, ()), float)).all()
+    }
     return replace(plan, columns={**plan.columns, **place})
+
+
+def without_estimates(plan: Table, calibration: Calibration) -> Table:
+    """A plan without the gravity, field and dip that a calibration estimated: they are no references of a run."""
+    place, cells = place_of(calibration), plan.columns
+    estimated = {REFERENCES[constant.name].column for constant in calibration.constants}
+    taken = {name for name in estimated & {*place} & {*cells} if np.all(cells[name] == place[name])}
+    return replace(plan, columns={name: cells[name] for name in cells if name not in taken})
 
 
 def at_temperature_of(plan: Table, calibration: Calibration) -> Table:

@@ -15,7 +15,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.runs import from_readings
 from mwdcal.geometry.vectors import Array
 from mwdcal.planning.expected import highest_order, nominal_run
-from mwdcal.planning.planned import Stand, move_seconds
+from mwdcal.planning.planned import USUAL_SOAK, USUAL_STAND, move_seconds
 from mwdcal.planning.plans import (
     ROOM_TEMPERATURE,
     Effects,
@@ -77,16 +77,17 @@ class Session:
         return simulated(truth, readings, rng, self.effects, common, self.minutes)
 
 
-def station_minutes(plan: Table, stand: Stand | None = None) -> Array:
+def station_minutes(plan: Table) -> Array:
     """When each station (n,) is read: moves, and a soak at each change of temperature."""
-    stand, attitude, soak = stand or Stand(), attitudes(plan), soak_numbers(plan)
-    steps = [move_seconds(attitude[i : i + 2], stand)[0, 1] / 60 for i in range(plan.count - 1)]
+    attitude, soak = attitudes(plan), soak_numbers(plan)
+    pairs = (attitude[i : i + 2] for i in range(plan.count - 1))
+    steps = [move_seconds(pair, USUAL_STAND)[0, 1] / 60 for pair in pairs]
     first = (
         soak_temperatures(plan)[soak[:1]] if "temperature_c" in plan.columns else ROOM_TEMPERATURE
     )
     changed = np.append(first != ROOM_TEMPERATURE, np.diff(soak) != 0)
-    settled = [stand.settle_seconds / 60, *steps]
-    return np.asarray(np.cumsum(settled + stand.soak_minutes * changed))
+    settled = [USUAL_STAND.settle_seconds / 60, *steps]
+    return np.asarray(np.cumsum(settled + USUAL_SOAK * changed))
 
 
 def simulated_run(

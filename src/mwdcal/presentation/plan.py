@@ -10,19 +10,21 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.options import ASSUMED, ASSUMED_PRACTICE
+from mwdcal.calibration.readings import SIMULATED, is_simulated, serial_of
 from mwdcal.calibration.record import Calibration, Finding, TriadCalibration, Undetermined
 from mwdcal.calibration.residuals import shown_in
 from mwdcal.calibration.results import accuracy_at, typical_accuracy
 from mwdcal.errors import InputError
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.files.contract import CHANNELS, REFERENCES
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
 from mwdcal.planning.planned import Planned, station_names
-from mwdcal.planning.plans import attitudes, soak_numbers, soak_temperatures
+from mwdcal.planning.plans import attitudes, place_of, soak_numbers, soak_temperatures
 from mwdcal.presentation.calibration import PLACE
 from mwdcal.presentation.envelope import json_document
-from mwdcal.presentation.numbers import files_written, quantity
+from mwdcal.presentation.numbers import capital, files_written, quantity
 from mwdcal.presentation.page import banner, rendered
 from mwdcal.presentation.stations import MOST_LINES
 from mwdcal.presentation.text import one_line, plural, table
@@ -53,8 +55,10 @@ WITHOUT_VERTICAL = "not at 0°: at the vertical, azimuth and toolface are undefi
 
 GOOD_FOR = "the calibration will be good for {:.0f}…{:.0f} °C"
 """The temperatures that a plan gives."""
-EFFICIENCY = "D-efficiency: how close the plan is to the best possible one of as many stations, which has 100 %"
+EFFICIENCY = "how close the plan is to the best possible one of as many stations, which has 100 %"
 """The meaning of the word in the table."""
+FAR_INCLINATION = 150.0
+"""Many stands that are turned by hand reach no larger inclination, degrees."""
 BY_HAND = 120.0
 """Seconds that a person takes for a station beyond move and settling: to set each scale, and to read and note."""
 
@@ -264,13 +268,14 @@ def screen(
 ) -> str:
     """The result for people."""
     summaries = [facts(each) for each in plans]
-    head = f"{plans[0].calibration.profile.name}   expected of a nominal tool, nothing measured"
+    head = f"{plans[0].calibration.profile.name}   {_basis(plans[0])}"
+    head += f"   {SIMULATED}" * _simulated(plans[0])
     blocks = [
         one_line(head),
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
     ]
     lines = [*_assumed(plans[0]), *_temperatures(plans), *_practice(summaries)]
-    lines += [*_inclinations(plans[0]), EFFICIENCY]
+    lines += [*_inclinations(plans[0]), *_far(plans), f"D-efficiency: {EFFICIENCY}"]
     blocks += filter(None, ["\n".join(lines)])
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
@@ -279,8 +284,21 @@ def screen(
     return "\n\n".join(blocks)
 
 
+def _basis(planned: Planned) -> str:
+    """The tool of which a plan expects its results."""
+    if (tool := planned.tool) is None:
+        return "expected of a nominal tool, nothing measured"
+    whose = f"tool {serial}" if (serial := serial_of(tool.tool)) else "the tool"
+    return f"expected of {whose} from its calibration of {tool.day}"
+
+
+def _simulated(planned: Planned) -> bool:
+    """Whether a plan rests on a simulated calibration."""
+    return planned.tool is not None and is_simulated(planned.tool.tool)
+
+
 def _assumed(planned: Planned) -> list[str]:
-    """Field, dip and gravity of the prediction as a line: field or dip that the plan does not state, if any."""
+    """Field, dip and gravity of the prediction as lines: field or dip that nothing states, if any."""
     if not planned.calibration.has_field:
         return []
     gravity, field, dip = (float(values[0]) for values in planned_earth(planned.plan))
@@ -288,8 +306,21 @@ def _assumed(planned: Planned) -> list[str]:
     blank = [word for name, word in words.items() if _is_blank(planned.plan, name)]
     if blank:
         return [f"the plan does not state the place; assumed: {', '.join(blank)}"]
-    stated = [] if _is_blank(planned.plan, "gravity") else [f"gravity {gravity:.5g} g"]
-    return [f"place: {', '.join([*words.values(), *stated])}"]
+    if not _is_blank(planned.plan, "gravity"):
+        words["gravity"] = f"gravity {gravity:.5g} g"
+    by_source: dict[str, list[str]] = {}
+    for name, word in words.items():
+        by_source.setdefault(_source(planned, name), []).append(word)
+    return [f"place{source}: {', '.join(some)}" for source, some in by_source.items()]
+
+
+def _source(planned: Planned, name: str) -> str:
+    """Who gives a constant of the place; blank: the plan."""
+    tool, column = planned.tool, REFERENCES[name].column
+    if tool is None or np.any(planned.plan.columns[column] != place_of(tool).get(column)):
+        return ""
+    estimated = any(constant.name == name for constant in tool.constants)
+    return ", estimated by the calibration" if estimated else ", from the calibration"
 
 
 def _temperatures(plans: Sequence[Planned]) -> list[str]:
@@ -325,6 +356,17 @@ def _inclinations(planned: Planned) -> list[str]:
     ]
 
 
+def _far(plans: Sequence[Planned]) -> list[str]:
+    """The option for a stand that turns less far than the plans, as a line, if they go far and nobody has used it."""
+    most = max(float(attitudes(each.plan)[:, 0].max()) for each in plans)
+    if most <= FAR_INCLINATION or ANGLES[0] in plans[0].stand.reach:
+        return []
+    return [
+        f"Inclinations up to {most:g}°. If your stand reaches less, add --reach inclination_deg=0:120 to --stations "
+        "or --accuracy."
+    ]
+
+
 def _is_blank(plan: Table, name: str) -> bool:
     """Whether a plan states a reference at no station."""
     return bool(
@@ -334,10 +376,11 @@ def _is_blank(plan: Table, name: str) -> bool:
 
 def comparison_rows(facts: Sequence[PlanSummary]) -> list[list[str]]:
     """The results of the plans, a plan in each column."""
+    option = "no oven: --soak 0" if any(each.soak_hours for each in facts) else "--soak"
     lines = [
         ["stations", *(str(each.stations) for each in facts)],
         ["at the stand, driven", *(f"{each.session_hours:.1f} h" for each in facts)],
-        ["of which soak (--soak)", *(f"{each.soak_hours:.1f} h" for each in facts)],
+        [f"of which soak ({option})", *(f"{each.soak_hours:.1f} h" for each in facts)],
         ["per station (--speed, --settle)", *(f"{_seconds_each(each):.0f} s" for each in facts)],
         [
             f"by hand, {BY_HAND / 60:g} min a station more",
@@ -461,7 +504,8 @@ def render(plans: Sequence[Planned], serial: str = "") -> str:
         summary=summaries[0],
         banner=_banner(first),
         findings=[*left_undetermined(first.calibration), *first.findings],
-        simulated=False,
+        simulated=_simulated(first),
+        basis="calibration" if first.tool else "profile",
         place=_place(first),
         titles=titles,
         channels=_channels(first.calibration),
@@ -472,13 +516,20 @@ def render(plans: Sequence[Planned], serial: str = "") -> str:
         asks_settings=not first.calibration.profile.stand.practice,
         compared=comparison_rows(summaries),
         plans=[each.plan for each in summaries],
-        inclinations=_inclinations(first),
+        lines=_sheet_lines(first),
         accuracy=accuracy_rows(summaries[0]),
         detectable=detectable_rows(summaries[0]),
         detectable_titles=DETECTABLE_TITLES,
         coverage=draw_coverage(plans),
         curves=draw_accuracy(plans),
     )
+
+
+def _sheet_lines(planned: Planned) -> list[str]:
+    """The place, the temperatures and the efficiency of a plan, and why it has few inclinations, as sentences."""
+    efficiency = f"D-efficiency, at least {100 * planned.efficiency:.0f} %: {EFFICIENCY}"
+    lines = [*_assumed(planned), *_temperatures([planned]), efficiency]
+    return [*(f"{capital(line)}." for line in lines), *_inclinations(planned)]
 
 
 def _sheet(plan: Table) -> tuple[list[str], list[tuple[list[str], bool]]]:
@@ -506,9 +557,9 @@ def _channels(calibration: Calibration) -> list[str]:
 
 def _place(planned: Planned) -> list[tuple[str, str]]:
     """Gravity, field and dip of the place with their units; blank where the plan does not state them."""
-    rows = []
+    rows, stated = [], planned.stated.columns
     for name, word in (("gravity", "Gravity, g"), ("field", "Field, nT"), ("dip", "Dip, °")):
-        values = np.unique(np.asarray(planned.plan.columns.get(REFERENCES[name].column, ()), float))
+        values = np.unique(np.asarray(stated.get(REFERENCES[name].column, ()), float))
         rows.append((word, f"{values[0]:.6g}" if len(values) == 1 else ""))
     return rows
 
@@ -521,9 +572,10 @@ def _banner(planned: Planned) -> dict[str, str]:
         for name, sd in summary.accuracy_deg.items()
         if sd is not None
     )
+    soak = f" and {summary.soak_hours:.1f} h of soak" if summary.soak_hours else ""
     headline = (
         f"{plural(summary.stations, 'station')} – about {summary.session_hours:.1f} h at a driven stand, "
-        f"{_seconds_each(summary):.0f} s a station and {summary.soak_hours:.1f} h of soak; "
+        f"{_seconds_each(summary):.0f} s a station{soak}; "
         f"{_by_hand(summary):.1f} h by hand"
     )
     after = (
@@ -532,7 +584,7 @@ def _banner(planned: Planned) -> dict[str, str]:
     )
     return banner(
         "attention" if free or planned.findings else "open",
-        "Planned – nothing measured",
+        f"Planned – {_basis(planned)}",
         headline,
         after,
     )

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.readings import SIMULATED
+from mwdcal.calibration.record import Finding
 from mwdcal.calibration.results import STATED_ANGLES
 from mwdcal.geometry.vectors import AnyArray
 from mwdcal.planning.plans import Effects
@@ -70,6 +71,7 @@ class SimulationSummary(msgspec.Struct, frozen=True, kw_only=True):
     effects: Effects
     stations: list[TrueAttitude] = []
     repetition: Repetition | None = None
+    findings: list[Finding]
     output: str
     truth: str
     plot: str

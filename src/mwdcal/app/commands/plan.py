@@ -60,16 +60,15 @@ from mwdcal.app.messages import print_result
 @options.preset(
     "--settle", type=float, default=30.0, metavar="S", help="From the end of a move to its reading."
 )
-@options.preset(
+@click.option(
     "--soak",
     type=float,
-    default=90.0,
     metavar="MIN",
-    help="To reach a temperature; 0 without an oven.",
+    help="To reach a temperature; 0 without an oven. Default: 90, but 0 where the plan has one temperature.",
 )
 @options.tool(
     help="Tool profile: a name that mwdcal list profiles shows, or a TOML file. Or a calibration (JSON): its profile, "
-    "the place of its run, and the noise that it estimated if the profile states none."
+    "its field, dip and gravity if the plan states none, and the noise that it estimated if the profile states none."
 )
 @click.option(
     "--serial",
@@ -91,13 +90,13 @@ from mwdcal.app.messages import print_result
 @options.JSON
 def command(
     plans: tuple[str, ...], stations: int | None, accuracy: tuple[str, ...], measured: Path | None,
-    reach: tuple[str, ...], criterion: Literal["D", "A", "I"], speed: float, settle: float, soak: float,
+    reach: tuple[str, ...], criterion: Literal["D", "A", "I"], speed: float, settle: float, soak: float | None,
     tool: str | None, serial: str, output: Path | None, report: Path | None, as_json: bool,
     **typed: Unpack[options.FitArguments],
 ) -> None:  # fmt: skip
     """Predict a calibration from planned stations: uncertainty, rank, accuracy, hours at the stand.
 
-    Nothing is measured: a nominal tool with the noise and the stand of the profile.
+    Nothing is measured: a nominal tool with the noise and the stand of the profile or calibration.
 
     \b
     Example: mwdcal plan --stations 24 --tool servo -o plan.csv --report sheet.html

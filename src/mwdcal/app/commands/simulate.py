@@ -116,7 +116,7 @@ def command(
             order=chosen.order,
         )
         result.save(output, truth)
-    print_result(result.to_dict() if as_json else result.summary())
+    print_result(result.to_dict() if as_json else result.summary(), result.findings)
 
 
 def _check(repeat: int | None, truth: Path | None, calibration: Path | None) -> None:
