@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from html import unescape
 
 import numpy as np
 import pytest
@@ -443,7 +444,7 @@ def test_a_test_outside_the_calibrated_temperatures_is_refused(tmp_path, fitted)
 
 
 def test_a_roll_test_outside_the_calibrated_temperatures_leaves_the_calibration(tmp_path, fitted):
-    """Files and screen are those of the fit alone; the reason ends the command as it ends `verify`."""
+    """The file and the screen are those of the fit alone; the reason ends the command, and is in page and JSON."""
     run = write_csv(tmp_path / "run.csv", fitted[1])
     test = write_csv(tmp_path / "r.csv", {**simulated(ROLL, 2), "temperature_c": np.full(12, 40.0)})
     alone, both, page = (tmp_path / name for name in ("alone.json", "both.json", "page.html"))
@@ -457,12 +458,15 @@ def test_a_roll_test_outside_the_calibrated_temperatures_leaves_the_calibration(
     assert "good for 20.0…30.0 °C" in ran.out
     assert "good for 20.0…30.0 °C" in reason
     assert fit.out.partition("\nwrote")[0] == ran.out.partition("\nwrote")[0]
-    assert "<html" in page.read_text("utf-8")
+    assert f"Not verified: {reason}" in unescape(page.read_text("utf-8"))
     first, second = (json.loads(path.read_text()) for path in (alone, both))
     assert {**first, "time": "", "sha256": ""} == {**second, "time": "", "sha256": ""}
     document = mwdcal(*command, "--json")
     assert document.code == 2
     assert "verification" not in document.json
+    assert {"id": "not-verified", "text": f"not verified: {reason}"} in [
+        {key: finding[key] for key in ("id", "text")} for finding in document.json["findings"]
+    ]
 
 
 def test_limits_that_cannot_be_read_are_refused_before_the_fit(tmp_path, fitted):

@@ -356,7 +356,7 @@ def files(tmp_path_factory):
 def test_the_command_says_still_fine(files):
     ran = command("diagnose", files / "tool.json", files / "demo" / "rolltest.csv")
     assert ran.code == 0
-    assert ran.out.startswith("still fine: ")
+    assert ran.out.startswith("no change found: ")
     assert "SIMULATED" in ran.out
 
 
@@ -522,6 +522,17 @@ def test_an_offset_of_the_stand_is_named_with_its_size_and_never_still_fine(angl
     assert offset.uncertainty == pytest.approx(0.1 / np.sqrt(3), rel=0.15) or angle == "toolface"
     assert not is_fine(result)
     assert f"offset of the stand's {angle}" in screen(result)
+
+
+def test_an_offset_within_the_stands_uncertainty_is_no_change_and_may_fail_a_limit():
+    """An offset of 0.5°, twice the limit of the error of inclination, on a stand of 0.3°."""
+    readings, _ = later(3)
+    known = {**readings.known, "inclination": readings.known["inclination"] + 0.5 * DEG}
+    coarse = on_uncertain_stand(replace(readings, known=known), 0.3)
+    assert not mwdcal.verify(tool(3)[0], coarse).passed
+    shown = screen(diagnose(tool(3)[0], coarse))
+    assert shown.startswith("no change found: noise and uncertainty explain")
+    assert "if these readings fail verify" in shown
 
 
 @pytest.mark.parametrize("zero", [0.0, 0.3])

@@ -685,3 +685,21 @@ def test_the_changelog_begins_with_the_version():
     assert dated[0][0] == mwdcal.__version__
     assert f"date-released: {dated[0][1]}\n" in cited
     assert len(text.splitlines()) <= 120
+
+
+def test_readings_without_a_file_and_a_serial_have_a_name_in_every_message(cal, rolltest, run):
+    """No brackets or words around a blank; the remedy is one that arrays have."""
+    said = {finding.id: finding.text for finding in cal.findings}["no-serial"]
+    assert 'in Python by metadata={"serial": "MWD-17"}' in said
+    raw = {name: [float(3 * k + i) for i in range(12)] for k, name in enumerate(("ax", "ay", "az"))}
+    raw |= {name: [0.5, -0.5] * 6 for name in ("mx", "my", "mz")}
+    with pytest.raises(mwdcal.InputError, match="The calibration of unnamed readings is for"):
+        mwdcal.apply(cal, raw)
+    verdict, named = mwdcal.verify(cal, rolltest), "unnamed readings"
+    assert verdict.summary().startswith(f"PASS   {named}   12 stations")
+    assert f"run {named}" in mwdcal.convert(cal, "factors").summary()
+    assert cal.summary().startswith(f"{named}   nominal   48 stations")
+    certificate = mwdcal.certificate(cal, verification=verdict)
+    assert f"as left   {named}   limits" in certificate.summary()
+    blank = mwdcal.calibrate(replace(run, metadata={"serial": " "}))
+    assert blank.glance()["tool"].startswith("nominal")

@@ -747,7 +747,11 @@ def test_a_table_of_one_inclination_says_what_a_calibration_lacks(tmp_path):
 
 def test_a_proposed_profile_says_which_practice_of_the_stand_is_assumed(tmp_path):
     text = library.propose_profile(write_csv(tmp_path / "a.csv", table())).to_toml()
-    assert '# settings =   # "per-direction" (assumed until stated)' in text
+    explained, line = text.partition("# toolface_deg =\n")[2].splitlines()[:2]
+    assert line.startswith(
+        '# settings = "per-direction"   # set once, then the tool is rolled; assumed'
+    )
+    assert explained.endswith('If you set the stand again at every station, write "per-station":')
 
 
 @pytest.mark.parametrize(("other", "named"), [("Roll test", True), ("Old void", False)])

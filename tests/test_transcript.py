@@ -8,7 +8,6 @@ import time
 import pytest
 
 from cli_support import ROOT, mwdcal
-from laboratories import laboratories
 
 PAGE = (ROOT / "docs" / "tutorials" / "transcript.md").read_text("utf-8")
 BLOCKS = re.findall(r"```console\n(.*?)```", PAGE, re.DOTALL)
@@ -30,8 +29,6 @@ def folder(tmp_path, monkeypatch):
     for path in (ROOT / "examples" / "laboratories").iterdir():
         if path.suffix in (".csv", ".xlsx"):
             shutil.copy(path, tmp_path)
-    pair = next(each for each in laboratories() if each.name == "tulsa_pair")
-    (tmp_path / pair.file).write_bytes(pair.content)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -1,4 +1,4 @@
-"""Three laboratories' tables and a roll test of each tool in the same form.
+"""Three laboratories' tables and a roll test of each tool in the same form; and a table that leaves a question open.
 
 Written by `PYTHONPATH=tests python examples/laboratories/make.py`.
 
@@ -15,6 +15,7 @@ from laboratories import ABERDEEN, CELLE, XIAN, Laboratory, directions_of, labor
 
 FOLDER = Path(__file__).resolve().parent
 PLACES = {"aberdeen_job_0117": ABERDEEN, "celle_c1187": CELLE, "xian_2309": XIAN}
+QUESTION = "tulsa_pair"
 ATTITUDES = np.array([(40.0, 155.0, 30.0 * k + 4.0) for k in range(12)])
 ANGLES = dict(
     zip(("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg"), ATTITUDES.T, strict=True)
@@ -73,7 +74,8 @@ def like(cell, value):
 
 if __name__ == "__main__":
     for each in laboratories():
-        if each.name in PLACES:
-            path = FOLDER / each.file
+        path = FOLDER / each.file
+        if each.name in (*PLACES, QUESTION):
             path.write_bytes(each.content)
+        if each.name in PLACES:
             path.with_stem(path.stem + "_roll").write_bytes(retested(each).content)

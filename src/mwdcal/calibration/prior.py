@@ -207,7 +207,7 @@ def from_calibration(previous: Calibration, relative: bool = False) -> PriorInfo
     covariance = previous.parameter_covariance
     moving = np.flatnonzero(np.diag(covariance) > 0)
     return PriorInformation(
-        previous.run,
+        previous.run_name,
         previous.reference_temperature,
         tuple(names[i] for i in moving),
         previous.parameters[moving],

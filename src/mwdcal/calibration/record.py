@@ -22,6 +22,7 @@ from mwdcal.calibration.readings import (
     Readings,
     ReadingsLike,
     as_readings,
+    serial_of,
     simulated,
     stated_day,
 )
@@ -328,6 +329,8 @@ def _added(unseen: UnseenDrift) -> str:
 SCHEMA_VERSION = 1
 DOCUMENT_VERSION = 1
 """Version of what commands print for machines: higher when a key goes, or changes its meaning."""
+UNNAMED = "unnamed readings"
+"""The name of readings without a file."""
 SOFTWARE = f"mwdcal {__version__}"
 """Name and version of the program."""
 MARGIN = 1.0
@@ -643,7 +646,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         accuracy = ", ".join(f"{name} {text}" for name, text in self._accuracy().items())
         findings = ", ".join(dict.fromkeys(finding.id for finding in self.findings))
         return {
-            "tool": " ".join([self.tool.get("serial", self.profile.name), *simulated(self.tool)]),
+            "tool": " ".join([self.tool_name, *simulated(self.tool)]),
             "run": f"{self.stations} stations, method {self.method}",
             "rank": rank,
             "accuracy": f"{accuracy} (1σ at 45° inclination)" if accuracy else "not stated",
@@ -725,7 +728,12 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def run_name(self) -> str:
         """The name of the run in messages: its file, if it had one."""
-        return self.run or "unnamed readings"
+        return self.run or UNNAMED
+
+    @property
+    def tool_name(self) -> str:
+        """The serial of the tool, else the name of its profile."""
+        return serial_of(self.tool) or self.profile.name
 
     @property
     def tool_type(self) -> str:

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 
 from msgspec import UNSET
 
-from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.record import UNNAMED, Calibration, Finding
 from mwdcal.certificate.document import ConformityTest, DecisionRule, LimitDecision, Quantity
 from mwdcal.files.verifications import Verification
 from mwdcal.geometry.vectors import Array, ArrayLike
@@ -162,7 +162,7 @@ def conformity(
         when=when,
         passed=passed,
         date=verification.date,
-        run=verification.run,
+        run=verification.run or UNNAMED,
         stations=verification.stations,
         limits=verification.limits,
         source=verification.source,

@@ -1867,7 +1867,8 @@ _STAND = [
     "",
     "# [stand]   # 1σ of one setting, degrees, by the stand's certificate; until stated its angles count as exact",
     *(f"# {name} =" for name in ("inclination_deg", "azimuth_deg", "toolface_deg")),
-    '# settings =   # "per-direction" (assumed until stated): set once, then the tool is rolled; or "per-station"',
+    '# Stations share the error of one setting. If you set the stand again at every station, write "per-station":',
+    '# settings = "per-direction"   # set once, then the tool is rolled; assumed until stated',
 ]
 """Lines to fill in: uncertainty and practice of the stand, which no table states."""
 

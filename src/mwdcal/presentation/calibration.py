@@ -249,9 +249,8 @@ def _possible(calibration: Calibration) -> str:
 
 def heading(calibration: Calibration) -> str:
     """Tool, run, method and rank of a calibration."""
-    serial = calibration.tool.get("serial", calibration.profile.name)
     inclinations = known_inclinations(calibration)
-    parts = [calibration.run, serial, f"{calibration.stations} stations"]
+    parts = [calibration.run_name, calibration.tool_name, f"{calibration.stations} stations"]
     if calibration.temperature_c:
         parts.append("{:.1f}–{:.1f} °C".format(*calibration.temperature_c))
     else:

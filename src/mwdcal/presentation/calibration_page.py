@@ -99,7 +99,7 @@ def render(
     first, left = leading_findings(findings)
     return template.render(
         cal=calibration,
-        name=calibration.tool.get("serial") or calibration.profile.name,
+        name=calibration.tool_name,
         verdict=verdict,
         banner=outcome(calibration, verdict),
         findings=findings,

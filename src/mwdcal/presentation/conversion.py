@@ -309,9 +309,8 @@ def screen(converted: Converted) -> str:
 def _heading(converted: Converted | Exported) -> list[list[str]]:
     """Whose calibration it is, and the digest of its file."""
     calibration = converted.calibration
-    serial = calibration.tool.get("serial", calibration.profile.name)
     file = [converted.name] if converted.name else []
-    first = [*file, serial, f"run {calibration.run}", calibration.software]
+    first = [*file, calibration.tool_name, f"run {calibration.run_name}", calibration.software]
     digest = [[f"SHA-256 {converted.sha256}"]] if converted.sha256 else []
     return [[*first, *simulated(calibration.tool)], *digest]
 

@@ -36,6 +36,8 @@ CHECK_STAND = "check the zero of the stand and the references, then repeat the r
 IN_HOLE = "run mwdcal survey --msa on these surveys: it estimates a field fixed in the tool and corrects for it"
 NOT_YET = "do not judge the tool by these readings alone"
 """The advice where no single fault explains readings, of surveys, and where a sound tool is not excluded."""
+UNLESS_FAILED = "if these readings fail verify, repeat them with less noise or a better-known stand"
+"""The advice beside a sound calibration: an uncertainty that explains all may be too large for a limit."""
 LEAST_LIKELIHOOD = 0.0005
 """Likelihoods below are shown as less than this."""
 MOVED_TITLES = ["channel", "by", "1σ", "unit"]
@@ -76,14 +78,14 @@ def render(result: Diagnosis, sha256: Mapping[str, str], *metadata: Mapping[str,
 
 
 def verdict(result: Diagnosis) -> str:
-    """One sentence: still fine, or the fault, where, and by how much; and what else it may be."""
+    """One sentence: no change, or the fault, where, and by how much; and what else it may be."""
     unexplained = _unexplained(result)
     if _by_stand(result):
         return f"{_offset(result)} explains these readings; the tool may be as calibrated"
     if result.fault == NONE:
         if unexplained:
             return "no single fault explains these readings, and none is named"
-        return "still fine: the readings are as the calibration says"
+        return "no change found: noise and uncertainty explain the readings"
     if unexplained:
         suspects: list[Diagnosis | Rival] = [result, *result.rivals]
         closest = [f"{each.fault}{_where(each)}" for each in suspects]
@@ -202,4 +204,6 @@ def next_step(result: Diagnosis) -> str:
     steps = [IN_HOLE if result.fault == "magnetised" and result.surveys else ADVICE[result.fault]]
     if result.fault in SURROUNDINGS and result.rivals:
         steps.append(NOT_YET)
+    if result.fault == NONE and not result.surveys:
+        steps.append(UNLESS_FAILED)
     return "; ".join(steps)

@@ -43,7 +43,7 @@ def render(result: Interference, sha256: Mapping[str, str]) -> str:
         "interference.html",
         *stated,
         summary=summary,
-        readings=result.readings.source,
+        readings=result.readings.name,
         calibration=result.calibration.run_name,
         banner=_banner(summary),
         findings=summary.findings,

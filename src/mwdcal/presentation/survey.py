@@ -98,7 +98,7 @@ def interference_screen(result: Interference, *metadata: Mapping[str, object]) -
     summary = result.summary
     count = len(summary.station_rows)
     heading = [
-        "multi-station analysis", result.readings.source, plural(count, "survey"), *simulated(*metadata)
+        "multi-station analysis", result.readings.name, plural(count, "survey"), *simulated(*metadata)
     ]  # fmt: skip
     lines = ["   ".join(heading), verdict(summary)]
     lines += [summary.missing] if summary.missing else []
@@ -251,8 +251,8 @@ def result_summary(result: SurveyedWell, output: str = "", html: str = "") -> Su
 def _run_of_well(place: int, run: SurveyedWell) -> RunOfWell:
     well, counts = run.well, run.counts
     return RunOfWell(
-        run=place, serial=serial_of(well.calibration.tool) or "", readings=well.readings.source,
-        readings_sha256=run.inputs.digests["readings"], calibration_run=well.calibration.run,
+        run=place, serial=serial_of(well.calibration.tool) or "", readings=well.readings.name,
+        readings_sha256=run.inputs.digests["readings"], calibration_run=well.calibration.run_name,
         calibration_time=well.calibration.time, calibration_sha256=run.inputs.digests["calibration"],
         years_since_calibration=well.errors.years if well.errors else None,
         rows=counts.rows, accepted=counts.accepted, rejected=counts.rejected,
@@ -389,7 +389,7 @@ def screen(
     counts += without_verdict(facts)
     if facts.blind:
         counts.append(f"{facts.blind} blind to interference")
-    heading = [well.readings.source, plural(facts.rows, "survey"), *counts]
+    heading = [well.readings.name, plural(facts.rows, "survey"), *counts]
     heading += [*signature_status(signature), *simulated(*metadata)]
     lines = [
         "   ".join(heading),

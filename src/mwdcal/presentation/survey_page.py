@@ -366,7 +366,7 @@ def render(surveyed: SurveyedWell, findings: list[Finding]) -> str:
         *stated,
         facts=facts,
         modelled=well.limits.probability is not None,
-        readings=well.readings.source,
+        readings=well.readings.name,
         banner=_banner(facts),
         findings=findings,
         strengths=strengths(well) if facts.not_judged < facts.rows else None,

@@ -127,7 +127,7 @@ def _advice(calibration: Calibration, name: str, each: Strengths, nominal: bool)
     if scale is not None:
         about = f" of about {scale:.4g} raw units per {unit}{_likely(name, each, scale)}"
     text = (
-        f"The calibration ({calibration.run}) is for {triad} readings{about}. Give the readings in the "
+        f"The calibration of {calibration.run_name} is for {triad} readings{about}. Give the readings in the "
         "units of its run, or the calibration that belongs to them."
     )
     if each.reference and not each.earth:

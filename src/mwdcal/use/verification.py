@@ -17,6 +17,7 @@ from mwdcal.calibration.readings import STAND_ANGLES_EXACT, Readings
 from mwdcal.calibration.record import (
     MARGIN,
     STATE_STAND,
+    UNNAMED,
     Calibration,
     Finding,
     html_table,
@@ -341,7 +342,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     @property
     def data(self) -> str:
         """The file of the roll test, and its sheet."""
-        return f"{self.run}, sheet '{self.sheet}'" if self.sheet else self.run
+        return f"{self.run}, sheet '{self.sheet}'" if self.sheet else self.run or UNNAMED
 
     @property
     def left_open(self) -> str:

@@ -91,16 +91,17 @@ def command(
     verdict, judged, refusal = NOT_JUDGED
     if turned is not None and rolltest:
         verdict, judged, refusal = _judged(calibration, turned, limits, (output, rolltest))
+    noted = _with_refusal(calibration, refusal) if refusal else calibration
     rendered = ""
     if report:
         from mwdcal.presentation.calibration_page import render
 
         tested = [turned.metadata] if turned else []
         names = {"file": output.name, "rolltest": run.name if beside else screen.NEXT_ROLL_TEST}
-        rendered = render(calibration, verdict, *tested, limits=bounds, **names)
+        rendered = render(noted, verdict, *tested, limits=bounds, **names)
     files = output, report
     shown = (
-        screen.summary(calibration, choice.curves, *files, _for_machines(verdict, output, rolltest))
+        screen.summary(noted, choice.curves, *files, _for_machines(verdict, output, rolltest))
         if as_json
         else screen.screen(calibration, choice.curves, *files, judged, run if beside else None)
     )
@@ -128,6 +129,16 @@ def _judged(
         error.args = (f"not verified: {error}",)
         return *NOT_JUDGED[:2], error
     return verdict, (screen(verdict, None), next_step(verdict, *files)), None
+
+
+def _with_refusal(calibration: Calibration, refusal: MwdcalError) -> Calibration:
+    """The calibration for page and JSON: a finding says why the roll test could not be judged."""
+    from msgspec.structs import replace
+
+    from mwdcal.calibration.record import Finding
+
+    finding = Finding(id="not-verified", text=str(refusal))
+    return replace(calibration, findings=[*calibration.findings, finding])
 
 
 @contextmanager

@@ -28,7 +28,7 @@ def command(
 
     \b
     Example: mwdcal diagnose tool.json rolltest.csv
-    Exit: 0 still fine, 1 a fault is named, 2 input cannot be read or is of the fit itself, 3 it leaves a question open.
+    Exit: 0 no change, 1 a fault is named, 2 input cannot be read or is of the fit itself, 3 it leaves a question open.
     """
     from msgspec.structs import replace
 

@@ -22,6 +22,7 @@ from mwdcal.calibration.diagnosis.flags import FittedRuns, Flag, listed, spaced
 from mwdcal.calibration.diagnosis.plausibility import (
     NOISE_RATIO,
     departures,
+    misfit_chances,
     robust,
     setting_chances,
     stations_to_reshoot,
@@ -69,7 +70,9 @@ def copies(result: Fit) -> Bools:
 
     All stations are compared only in runs where two agree that are near each other on one line through the readings.
     """
-    noise = _noise_in_residuals(result)
+    less = np.minimum(np.nan_to_num(result.analysis.variance_factor, nan=1.0), 1.0)
+    noise = reading_noise(result) * np.sqrt(less)  # as the residuals have it where more is declared
+    noise = np.where(noise > 0, noise, 1.0)
     rows = np.concatenate(
         [t.raw / noise[:, [i], None] for i, t in enumerate(result.problem.triads)], -1
     )
@@ -90,13 +93,6 @@ def copies(result: Fit) -> Bools:
     for member in np.flatnonzero(agree):
         again[member] = repeated(rows[member])
     return again
-
-
-def _noise_in_residuals(result: Fit) -> Array:
-    """Noise (B, t) of a reading, as the residuals have it where more is declared; one where there is none."""
-    less = np.minimum(np.nan_to_num(result.analysis.variance_factor, nan=1.0), 1.0)
-    noise = reading_noise(result) * np.sqrt(less)
-    return np.where(noise > 0, noise, 1.0)
 
 
 NEARLY_ALL = 0.9
@@ -341,7 +337,7 @@ def _noise(fitted: FittedRuns) -> Iterator[Flag]:
     """Residuals far below the declared noise, then those far beyond it."""
     result, analysis, chances = fitted.result, fitted.result.analysis, fitted.chances
     declared, factor = np.isnan(result.noise), analysis.variance_factor
-    small = fitted.small_chances
+    small = misfit_chances(result, fitted.freedom, small=True)
     calm = declared & (small < MISFIT_CHANCE)
     weighed = robust(result)[:, None] & declared & ~unchecked(result)
     large = weighed & (factor > NOISE_RATIO**2) | (chances < MISFIT_CHANCE)

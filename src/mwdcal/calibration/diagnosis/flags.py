@@ -113,11 +113,6 @@ class FittedRuns:
         return freedom_of(self.result)
 
     @cached_property
-    def small_chances(self) -> Array:
-        """`misfit_chances` (B, t) of residuals as small."""
-        return misfit_chances(self.result, self.freedom, small=True)
-
-    @cached_property
     def covariance(self) -> StatedCovariance:
         """The covariance of the fits' parameters."""
         return StatedCovariance(self.result)

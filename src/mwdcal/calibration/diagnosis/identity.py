@@ -31,7 +31,7 @@ def unidentified(serials: Mapping[str, str | None]) -> list[Finding]:
     unknown = "that they are of the same tool" if len(serials) > 1 else "which tool it is of"
     text = (
         f"no serial in {' and '.join(lacking)}: nothing shows {unknown}. State it in each run: in a line above the "
-        """names, '# serial = "MWD-17"', or in a column serial."""
+        """names, '# serial = "MWD-17"', in a column serial, or in Python by metadata={"serial": "MWD-17"}."""
     )
     return [Finding(id=UNIDENTIFIED, text=text)]
 
