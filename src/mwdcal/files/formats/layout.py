@@ -26,7 +26,7 @@ from mwdcal.files.formats.columns import (
     as_text,
     letters_of,
     looks_numeric,
-    plain_names,
+    plain_headings,
     shown,
 )
 from mwdcal.files.formats.settings import (
@@ -393,7 +393,7 @@ def _of_stations(tool: Layout, stand: Layout) -> Layout | None:
             said = f"{what} are those of {where} at the same {shown(name)}."
             return replace(
                 tool,
-                names=plain_names([*tool.names, *(stand.names[k] for k in more)]),
+                names=plain_headings([*tool.names, *(stand.names[k] for k in more)]),
                 units=[*tool.units, *(stand.units[k] for k in more)],
                 cells=[*tool.cells, *([stand.cells[k][row] for row in rows] for k in more)],
                 texts=[*tool.texts, *([stand.texts[k][row] for row in rows] for k in more)],
@@ -438,7 +438,7 @@ def _side_by_side(one: Layout, other: Layout) -> Layout:
     """A table with the columns of another sheet that it does not have."""
     _, equal = _shared(one, other)
     more = [k for k, name in enumerate(other.names) if name not in equal]
-    names = plain_names([*one.names, *(other.names[k] for k in more)])
+    names = plain_headings([*one.names, *(other.names[k] for k in more)])
     places = [shown(t.sheet if one.sheet != other.sheet else t.heading) for t in (one, other)]
     said = (
         f"{' and '.join(places)} are one table: in all {len(one.lines)} rows they have "
@@ -1175,7 +1175,7 @@ def _with_rows_of_headings(layout: Layout) -> Layout:
     said = f"the groups of columns of {', '.join(places)} are rows, with {shown(headings.name)} by their headings."
     return replace(
         layout,
-        names=plain_names([*(layout.names[k] for k in others), *headings.places, headings.name]),
+        names=plain_headings([*(layout.names[k] for k in others), *headings.places, headings.name]),
         units=[*(layout.units[k] for k in [*others, *units]), ""],
         cells=below(layout.cells),
         texts=below(layout.texts),
@@ -1210,7 +1210,7 @@ def _with_triad_above(layout: Layout) -> Layout:
         unit or (stated[0] if stated and k in axes else "") for k, unit in enumerate(layout.units)
     ]
     names = [_with_title(title, n) if k in axes else n for k, n in enumerate(layout.names)]
-    return replace(layout, names=plain_names(names), units=units)
+    return replace(layout, names=plain_headings(names), units=units)
 
 
 def _with_triads_beside(layout: Layout) -> Layout:
@@ -1246,7 +1246,7 @@ def _pivoted(
     names = [_with_title(value, layout.names[k]) for k, value in more]
     return replace(
         layout,
-        names=plain_names([*(layout.names[k] for k in shared), *names]),
+        names=plain_headings([*(layout.names[k] for k in shared), *names]),
         units=[layout.units[k] for k in (*shared, *(k for k, _ in more))],
         cells=beside(layout.cells),
         texts=beside(layout.texts),
@@ -1353,7 +1353,7 @@ def _used(
     columns = [[row[k] if k < len(row) else "" for _, row in rows] for k in range(width)]
     used = [k for k in range(width) if names[k] or any(cell != "" for cell in columns[k])]
     return (
-        plain_names([names[k] for k in used]),
+        plain_headings([names[k] for k in used]),
         [units[k] for k in used],
         [columns[k] for k in used],
         [letters_of(first + k) for k in used],
@@ -1373,7 +1373,7 @@ def _apart(
         parts: Iterable[Cells] = cells or [column]
         whole += [(part, unit, [*c], letter) for part, c in zip(each, parts, strict=True)]
     return (
-        plain_names([each[0] for each in whole]),
+        plain_headings([each[0] for each in whole]),
         [each[1] for each in whole],
         [each[2] for each in whole],
         [each[3] for each in whole],
