@@ -49,6 +49,8 @@ from mwdcal.sensor.profile import ColumnSource
 
 MEASURED_BY_TOOL = "the tool has measured"
 """In questions on angles that fit the readings whatever the stand shows."""
+SIDE_BY_SIDE = "stand side by side"
+"""In the question on channels of several tools, whatever the readings fit."""
 BOTH_UNITS = " and "
 """What stands between two units of one column, of which one is wrong."""
 IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
@@ -1110,8 +1112,8 @@ class Questions(list[QuestionError]):
         """Whether there is a question with one of some texts in it."""
         return any(text in each.text for each in self for text in texts)
 
-    def settle(self, words: str) -> bool:
-        """Whether there is a question of these words; others on columns that each of its answers takes are left out."""
+    def settle(self, words: str) -> None:
+        """Leave out questions on columns that each answer to a question of these words takes."""
         question = next((each for each in self if words in each.text), None)
         taken = [_columns_of(each) for each in question.answers] if question else []
         self[:] = [
@@ -1121,7 +1123,6 @@ class Questions(list[QuestionError]):
             or not (taken and each.answers)
             or not set[str]().union(*map(_columns_of, each.answers)) <= set.intersection(*taken)
         ]
-        return question is not None
 
     def raise_any(self, source: str) -> None:
         """Raise all questions together."""
@@ -1179,7 +1180,7 @@ def proposed(
     angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen and c not in said}
     for column in angles:
         questions.ask(_check_nominal, column, angles, names, values, source)
-    beside = questions.settle("side by side") or questions.hold("channels of the magnetometer")
+    beside = questions.hold(SIDE_BY_SIDE, "channels of the magnetometer")
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
         # Without accelerometers either triad may be either.
         believed = questions.believed() if {*RAW[:3]} & {*chosen} else ()
@@ -1187,6 +1188,7 @@ def proposed(
         questions.ask(_check_nameless, others, values, chosen, known, source)
     present = {*chosen, *said, *known, *of_vectors(chosen)}
     _ask_lacking(present, every, meanings, values, questions, source)
+    questions.settle(SIDE_BY_SIDE)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
@@ -1654,7 +1656,7 @@ def _check_triads(
     others = [n for n in names if n not in {each.name for each in chosen.values()}]
     listed = f"the names are {', '.join(map(shown, names[:20]))}"
     if {*RAW[:3]}.isdisjoint(chosen):
-        _check_side_by_side(others, values, source)
+        _check_side_by_side(names, values, source)
         raise QuestionError(
             f"{source}: could not tell which columns are the accelerometers ({', '.join(RAW[:3])}); {listed}.",
             triples_for(RAW[:3], others, values, OF_ONE_SPHERE)
@@ -1679,33 +1681,48 @@ def _check_triads(
 
 
 def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> None:
-    """Ask which of several tools is meant whose channels stand side by side, each under the tool's own title."""
+    """Ask which of several tools is meant whose channels stand side by side, each under the tool's own title.
+
+    An answer takes the tool's temperature too; of a tool without one, beside another that has one, none.
+    """
     tools: dict[str, dict[str, str]] = {}
     for name in names:
         words = name.split()
         for place in range(len(words) - 1, 0, -1):
-            rest = " ".join(words[place:])
-            alike = Resemblance(WARMTH) if _BARE_T.fullmatch(rest) else meaning(rest)
-            if alike and alike.column in (*RAW, WARMTH):
+            alike = meaning(" ".join(words[place:]))
+            if alike and alike.column in RAW:
                 tools.setdefault(" ".join(words[:place]), {})[alike.column] = name
                 break
     whole = {title: each for title, each in tools.items() if {*RAW[:3]} <= {*each}}
+    warm = {title: _warmth_below(title, names) for title in whole}
     if len(whole) > 1:
         answers = [
             Answer(
                 with_values(title, values, each["ax"]),
                 (
                     *(("column", f"{column}={name}") for column, name in each.items()),
+                    *([("column", f"{WARMTH}={warm[title]}")] if any(warm.values()) else []),
                     *(("serial", str(s)) for s in [titles([[title]]).metadata.get("serial")] if s),
                 ),
             )
             for title, each in whole.items()
         ]
         raise QuestionError(
-            f"{source}: the channels of {len(whole)} tools stand side by side: {', '.join(map(shown, whole))}. Which "
+            f"{source}: the channels of {len(whole)} tools {SIDE_BY_SIDE}: {', '.join(map(shown, whole))}. Which "
             "one is meant?",
             answers,
         )
+
+
+def _warmth_below(title: str, names: Sequence[str]) -> str:
+    """The one column that is called a temperature behind the title of a tool; empty where none or several are."""
+    behind = {n: n[len(title) :].strip() for n in names if n.startswith(f"{title} ")}
+    warm = [
+        n
+        for n, text in behind.items()
+        if _BARE_T.fullmatch(text) or ((alike := meaning(text)) and alike.column == WARMTH)
+    ]
+    return warm[0] if len(warm) == 1 else ""
 
 
 def _check_hidden(

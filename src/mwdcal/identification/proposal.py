@@ -74,6 +74,7 @@ from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside
 from mwdcal.identification.columns import (
     MEASURED_BY_TOOL,
+    SIDE_BY_SIDE,
     answers_of_north,
     in_units,
     is_computed,
@@ -827,9 +828,10 @@ def _alike(angles: Array) -> float:
 def _is_of_readings(answer: Answer, question: QuestionError) -> bool:
     """Whether an answer names columns that the readings tell; of azimuths they tell the north as well.
 
-    Angles that the tool itself may have measured fit its readings whatever the stand shows.
+    Angles that the tool itself may have measured fit its readings whatever the stand shows, and the channels of each
+    of several tools fit.
     """
-    if MEASURED_BY_TOOL in question.text:
+    if any(words in question.text for words in (MEASURED_BY_TOOL, SIDE_BY_SIDE)):
         return False
     pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
     return len(pairs) == len(answer.arguments) and all(
