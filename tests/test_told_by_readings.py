@@ -440,6 +440,76 @@ def test_a_column_in_a_unit_of_temperatures_is_named_with_the_option_that_takes_
     assert "--column" not in taken.err
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["Heat at the end of the probe, by the sensor of March (C)", "'Probe heat' (C)"],
+)
+def test_a_name_that_messages_cut_or_quote_is_whole_in_the_option_that_takes_it(tmp_path, name):
+    columns = table() | {name: np.asarray(table()["Temp (C)"]), "Heat (C)": np.full(48, 20.0)}
+    del columns["Temp (C)"]
+    said = findings_of(library.propose_profile(written(tmp_path / "a.csv", columns)))
+    del columns["Heat (C)"]
+    columns[name][0] = np.nan
+    columns[name] = ["" if cell != cell else cell for cell in columns[name].tolist()]
+    alone = findings_of(library.propose_profile(written(tmp_path / "b.csv", columns)))
+    assert f"'temperature_c={name}'" in alone["temperature-by-unit"]
+    assert "temperature-by-unit" in said
+
+
+OF_OTHER_THINGS = (
+    "Stand electronics (°C)", "Power supply (°C)", "PSU temp (C)", "Oven set point (°C)", "T_set (°C)", "PTemp_C",
+    "Logger temp (C)", "Turntable temp (C)", "Prüfstand (°C)", "Netzteil (°C)", "Темп. стенда (°C)", "Coil temp (C)",
+)  # fmt: skip
+AROUND = (
+    "Oven temp (C)", "Room (°C)", "Ambient (°C)", "Lab (°C)", "Thermostat temp (C)", "Raumtemperatur (°C)",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OF_OTHER_THINGS)
+def test_the_temperature_of_another_thing_is_asked_about_and_never_before_one_of_the_tool(
+    tmp_path, name
+):
+    """Alone it is asked about; beside an oven's that is taken, and beside the tool's this."""
+    columns = table()
+    warm = np.asarray(columns.pop("Temp (C)"))
+    path = written(tmp_path / "a.csv", columns | {name: warm})
+    with pytest.raises(FitError, match="not the temperature of the tool, and no other") as error:
+        library.propose_profile(path)
+    (question,) = error.value.questions
+    assert [each.arguments[0][1] for each in question.answers] == [
+        "temperature_c=",
+        f"temperature_c={name}",
+    ]
+    assert read(path, column=f"temperature_c={name}").temperature == pytest.approx(warm)
+    assert read(path, column="temperature_c=").temperature is None
+    for other in ("Oven temp (C)", "Tool temp (C)", "Board temp (C)"):
+        beside = columns | {name: warm + 3, other: warm}
+        assert read(written(tmp_path / "b.csv", beside)).temperature == pytest.approx(warm), other
+
+
+@pytest.mark.parametrize("name", AROUND)
+def test_what_is_around_the_tool_has_its_temperature_where_nothing_else_has(tmp_path, name):
+    columns = table()
+    warm = np.asarray(columns.pop("Temp (C)"))
+    proposal = library.propose_profile(written(tmp_path / "a.csv", columns | {name: warm}))
+    assert proposal.profile.columns["temperature_c"].name == name
+    assert f"{name!r} is taken" in findings_of(proposal)["oven-temperature"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["Gx temp comp (g)", "Temp comp Hx (nT)", "Bx (nT) temp corrected", "Temp X (g)", "Tmep (g)", "Tool T (uT)",
+     "Sensor temp (m/s2)", "Temperatur (mG)"],
+)  # fmt: skip
+def test_a_channel_in_units_of_gravity_or_field_is_no_temperature(tmp_path, name):
+    """Not beside one, nor where the table has none."""
+    columns = table() | {name: np.asarray(table()["Hx (V)"])}
+    assert read(written(tmp_path / "a.csv", columns)).temperature == pytest.approx(
+        np.asarray(columns.pop("Temp (C)"))
+    )
+    assert read(written(tmp_path / "b.csv", columns)).temperature is None
+
+
 @pytest.mark.parametrize("name", ["Dew point (C)", "Probe heat SD (C)", "Set point (C)"])
 def test_another_thing_in_degrees_celsius_is_no_temperature_of_the_tool(tmp_path, name):
     columns = {(name if n == "Temp (C)" else n): v for n, v in table().items()}

@@ -161,6 +161,17 @@ def is_of_surroundings(name: str) -> bool:
     return bool(_SURROUNDINGS.search(name))
 
 
+def is_not_of_tool(name: str) -> bool:
+    """Whether a column is called the temperature of other equipment, or one that was set.
+
+    >>> [is_not_of_tool(n) for n in ("Stand electronics", "Oven set point", "PTemp", "Tool in stand", "Electronics")]
+    [True, True, True, False, False]
+    """
+    text = f"{name}, {spelled(name)}"
+    other = _BY_STAND.search(text) or _OF_EQUIPMENT.search(text) or _is_nominal(name)
+    return bool(other) and not _BY_TOOL.search(text)
+
+
 def warm_unit(name: str, unit: str) -> str:
     """The unit of temperatures in brackets in a name or in the row of units; empty if the name says another thing.
 
@@ -552,11 +563,19 @@ _SPOKEN_WARMTH = {
 }
 """Units of temperatures in a line above a table, not those of a number."""
 _SURROUNDINGS = re.compile(
-    r"oven|chamber|ambient|panel|logger|(?<![a-z])p_?temp(?![a-z])|kamer\b|(?<![a-z])(air|aire|ar|luft|room|bath|lab)(?![a-z])|ofen|kammer|sala|habitaci|oficina|umgebung|raum|ovn|rom|horno|ambiente|"
+    r"oven|chamber|ambient|thermostat|kamer\b|(?<![a-z])(air|aire|ar|luft|room|bath|lab(or\w*)?)(?![a-z])|ofen|kammer|sala|habitaci|oficina|umgebung|raum|ovn|rom|horno|ambiente|"
     r"камер|печ|термостат|воздух|空气|环境|烘箱|室温",
     re.IGNORECASE,
 )
-"""What has a temperature of its own that is not the tool's."""
+"""What the tool is in, and has a temperature of its own."""
+_OF_EQUIPMENT = re.compile(
+    r"(?<![^\W\d_])(power|suppl(y|ies)|psu|netz(teil|ger(ä|ae)t)\w*|str(om|øm)(versorgung|forsyning)|fuente|fonte|alimenta\w*|"
+    r"питани\w*|rack|cabinet|panel|p_?temp|logger|daq|dmm|multimeter|pc|computer|rechner|ordenador|компьютер\w*|"
+    r"controller|regler|steuerung|контроллер\w*|motor|amplifier|heat ?sink|outside|outdoors?|exterior|au(ß|ss)en\w*|"
+    r"наружн\w*|observatory|coils?|helmholtz\w*|check standard|golden|dummy)(?![^\W\d_])|电源|控制器|室外",
+    re.IGNORECASE,
+)
+"""What stands beside the tool, or elsewhere, and has a temperature of its own."""
 _OF_OTHER_WARMTH = re.compile(
     r"(?<![^\W\d_])(sd|std|stdev|dev|sigma|unc|delta|diff|dew|rate|grad\w*|min|max|limit|range|offset|coeff\w*)(?![^\W\d_])",
     re.IGNORECASE,
@@ -741,6 +760,7 @@ def meanings_of(
         for name, unit in zip(names, units, strict=True)
         if (m := meaning(once[name], unit))
         and not (m.column in RAW and m.unit in ("°", "rad", "gon"))
+        and not (m.column == WARMTH and m.unit in _OF_UNITS)
     }
     results = _by_legend(names, above) | results | _explained(names, above)
     results |= _behind_titles(names, units, results)
@@ -1261,8 +1281,10 @@ def _chosen(
         damaged = [problems[n] for n in alike if n in problems]
         if damaged and not _stated_among(candidates):
             questions += damaged
-        name = questions.ask(_one, column, candidates, values, source) if candidates else None
-        if name:
+        answered = candidates[0] if candidates and column in said else ""
+        if not answered and candidates:
+            answered = questions.ask(_one, column, candidates, values, source)
+        if name := answered:
             stated = meanings[name].unit or _angles(column, spoken)
             stated = stated or (warmth if column == WARMTH else "")
             cells = values(name)
@@ -1383,14 +1405,16 @@ def _tell_temperature(
     others = {n: unit for n, unit in zip(names, units, strict=True) if n not in meanings}
     lone = [n for n, unit in others.items() if _BARE_T.fullmatch(f"{n} {unit}".strip())]
     warm = {} if lone else {n: w for n, unit in others.items() if (w := warm_unit(n, unit))}
-    lone += [n for n, unit in warm.items() if unit == "°C" and not is_of_surroundings(n)]
-    cells = values(lone[0]) if len(lone) == 1 >= len(warm) else None
-    if warm and cells is not None and not np.isfinite(cells).all():
-        return
-    known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
-    known = known[~is_filler(known)]
-    if known.size and np.all((known >= -60) & (known <= 500)) and not is_numbering(known):
-        meanings[lone[0]] = Resemblance(WARMTH, warm.get(lone[0], ""))
+    own = {n: unit for n, unit in warm.items() if not is_not_of_tool(n)}
+    lone += [n for n, unit in own.items() if unit == "°C" and not is_of_surroundings(n)]
+    clear = len(lone) == 1 >= len(own)
+    for name in lone if clear else () if own else warm:  # of which it is asked
+        cells = values(name)
+        if cells is None or (warm and not np.isfinite(cells).all()):
+            continue
+        known = cells[np.isfinite(cells) & ~is_filler(cells)]
+        if known.size and np.all((known >= -60) & (known <= 500)) and not is_numbering(known):
+            meanings[name] = Resemblance(WARMTH, warm.get(name, ""))
 
 
 def _tell_references(
@@ -1564,6 +1588,7 @@ def _check_lacking(
         and (n in shows or not is_of_tool(n) or _is_whole(cells))
         and _may_be_in_a_unit(column, cells)
         and _may_hold(column, cells)
+        and not (column == WARMTH and _unit_beside(n, others[n]) in _OF_UNITS)
         and not _is_total(column, cells, "", names, values)
     }
     named = [n for n in numbers if _ends_as(n, column)]
@@ -1879,8 +1904,7 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
     if column in candidates:
         return column
     if column == WARMTH:
-        of_tool = [n for n in candidates if not is_of_surroundings(n)] or candidates
-        candidates = [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
+        candidates = _nearest(candidates, values, source)
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
     shows = [name for name in candidates if _is_shown(name) and not _is_nominal(name)]
     others = [name for name in candidates if name not in shows]
@@ -1900,6 +1924,19 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
         f"{source}: {' and '.join(map(shown, candidates))} may each be {of}. {advice}",
         candidates_for(column, candidates, values),
     )
+
+
+def _nearest(candidates: Sequence[str], values: Values, source: str) -> Sequence[str]:
+    """Of temperatures those of the tool, else those around it; a question where all are of something else."""
+    beside = [n for n in candidates if not is_not_of_tool(n)]
+    if not beside:
+        raise QuestionError(
+            f"{source}: {' and '.join(map(shown, candidates))} by the name is not the temperature of the tool, and no "
+            "other column is. Is the run to do without temperature?",
+            [none_of(WARMTH), *candidates_for(WARMTH, candidates, values)[:-1]],
+        )
+    of_tool = [n for n in beside if not is_of_surroundings(n)] or beside
+    return [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
 
 
 def _unit(column: str, name: str, stated: str, values: Array | None, source: str) -> str:
