@@ -50,7 +50,8 @@ from mwdcal.sensor.profile import ColumnSource
 MEASURED_BY_TOOL = "the tool has measured"
 """In questions on angles that fit the readings whatever the stand shows."""
 SIDE_BY_SIDE = "stand side by side"
-"""In the question on channels of several tools, whatever the readings fit."""
+OF_SEVERAL_TOOLS = f"tools {SIDE_BY_SIDE}"
+"""In questions on channels below several titles, and on those of several tools, whatever the readings fit."""
 BOTH_UNITS = " and "
 """What stands between two units of one column, of which one is wrong."""
 IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
@@ -1708,7 +1709,8 @@ def _check_triads(
 def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> None:
     """Ask which of several tools is meant whose channels stand side by side, each under the tool's own title.
 
-    An answer takes the tool's temperature too; of a tool without one, beside another that has one, none.
+    An answer takes the tool's temperature too; of a tool without one, beside another that has one, none. A run beside
+    its roll test is of one tool.
     """
     tools: dict[str, dict[str, str]] = {}
     for name in names:
@@ -1719,7 +1721,9 @@ def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> No
                 tools.setdefault(" ".join(words[:place]), {})[alike.column] = name
                 break
     whole = {title: each for title, each in tools.items() if {*RAW[:3]} <= {*each}}
-    warm = {title: _warmth_below(title, names) for title in whole}
+    of_one = any(OF_CHECKS.search(title) and OF_ROLLS.search(title) for title in whole)
+    warm = {} if of_one else {title: _warmth_below(title, names) for title in whole}
+    beside = f"a run and its test {SIDE_BY_SIDE}" if of_one else f"{len(whole)} {OF_SEVERAL_TOOLS}"
     if len(whole) > 1:
         answers = [
             Answer(
@@ -1733,8 +1737,7 @@ def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> No
             for title, each in whole.items()
         ]
         raise QuestionError(
-            f"{source}: the channels of {len(whole)} tools {SIDE_BY_SIDE}: {', '.join(map(shown, whole))}. Which "
-            "one is meant?",
+            f"{source}: the channels of {beside}: {', '.join(map(shown, whole))}. Which one is meant?",
             answers,
         )
 

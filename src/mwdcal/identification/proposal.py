@@ -74,7 +74,7 @@ from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside
 from mwdcal.identification.columns import (
     MEASURED_BY_TOOL,
-    SIDE_BY_SIDE,
+    OF_SEVERAL_TOOLS,
     answers_of_north,
     in_units,
     is_computed,
@@ -833,7 +833,7 @@ def _is_of_readings(answer: Answer, question: QuestionError) -> bool:
     Angles that the tool itself may have measured fit its readings whatever the stand shows, and the channels of each
     of several tools fit.
     """
-    if any(words in question.text for words in (MEASURED_BY_TOOL, SIDE_BY_SIDE)):
+    if any(words in question.text for words in (MEASURED_BY_TOOL, OF_SEVERAL_TOOLS)):
         return False
     pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
     return len(pairs) == len(answer.arguments) and all(

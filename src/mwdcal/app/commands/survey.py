@@ -163,14 +163,14 @@ def command(
 
     \b
     Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --report well.html
-    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 a question is open, or with --msa:
-    the surveys do not separate interference from azimuth.
+    Exit: 0 written, 2 input cannot be read, does not belong to the calibration, or lacks the depths of positions asked
+    for by an option, 3 a question is open, or with --msa: the surveys do not separate interference from azimuth.
     """
     from mwdcal.files.formats import atomic
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.survey import long_table
     from mwdcal.survey.runs import survey_runs
-    from mwdcal.survey.surveying import analysed, check_drift
+    from mwdcal.survey.surveying import analysed, check_drift, check_path
 
     if msa_html and (not msa or run):
         raise InputError("`msa_html` goes with `msa` of one run. Leave it out, or add `msa`.")
@@ -201,6 +201,14 @@ def command(
     _check_analyses(inputs, analyses, loaded, pages, report, as_json)
     way: Any = {"tie_in": start, "switch": ends, "outside": outside, "axial": axial_correction}
     result = survey_runs(inputs, analyses, **way)
+    lacking = next((each.text for each in result.well.findings if each.id == "no-path"), "")
+    check_path(
+        lacking,
+        tie_in=tie_in,
+        section_azimuth=section_azimuth,
+        covariance=covariance,
+        listing=listing,
+    )
     pages += _pages(result, report, contributions, station) + _listing(result, listing)
     atomic.write_all([_table(result, output, covariance), *pages])
     files, more = (
