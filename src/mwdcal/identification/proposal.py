@@ -1663,17 +1663,26 @@ _OTHER_SIGN = str.maketrans("+-", "-+")
 
 
 def lines_not_taken(proposal: Proposal) -> list[Finding]:
-    """A finding on each nominal or unclear reference beside the table, where the run has no other."""
+    """A finding on each reference beside the table that is nominal or unclear, where the run has no other, or another.
+
+    Another one is of a place or a day that the table says not to be those of the run.
+    """
     columns = proposal.profile.columns
     named = {} if isinstance(columns, msgspec.UnsetType) else columns
-    lines = proposal.where.titles.not_taken if proposal.where else {}
-    return references_not_taken(
-        {
-            c: shown(t)[1:-1]
-            for c, t in lines.items()
-            if c not in named and c not in proposal.metadata
-        }
-    )
+    if proposal.where is None:
+        return []
+    block, stated = proposal.where.titles, proposal.metadata
+    others = [
+        Finding(
+            id="reference-not-taken",
+            text=f"{column}: {stated[column]:.8g} is taken, by the words beside it, and not {other:.8g} of the line "
+            f"{shown(line)}. If that one holds, state it in a column.",
+        )
+        for column, (line, other) in block.others.items()
+        if column in stated and not (column in named and named[column].name in proposal.where.names)
+    ]
+    lines = {c: shown(t)[1:-1] for c, t in block.not_taken.items() if c not in {*named, *stated}}
+    return others + references_not_taken(lines)
 
 
 def answers_by_readings(proposal: Proposal) -> list[Finding]:

@@ -635,7 +635,8 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
     metadata = {**stated, **block.metadata}
     not_taken = {c: line for b in [*blocks[::-1], block] for c, line in b.not_taken.items()}
     choices = {c: each for b in [*blocks[::-1], block] for c, each in b.choices.items()}
-    whole = Titles(metadata, "" if "date" in metadata else day, not_taken, choices)
+    others = {c: line for b in [*blocks[::-1], block] for c, line in b.others.items()}
+    whole = Titles(metadata, "" if "date" in metadata else day, not_taken, choices, others)
     return replace(layout, titles=whole if blocks else block)
 
 
