@@ -510,6 +510,65 @@ def test_a_channel_in_units_of_gravity_or_field_is_no_temperature(tmp_path, name
     assert read(written(tmp_path / "b.csv", columns)).temperature is None
 
 
+def in_minutes(angles):
+    """Angles as degrees and minutes: 13-59."""
+    minutes = [round(60 * angle) for angle in np.asarray(angles)]
+    return [f"{each // 60}-{each % 60:02d}" for each in minutes], np.array(minutes) / 60
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("θ", "φ", "ψ"), ("θ", "ψ", "φ"), ("Θ", "Φмагн", "Ψ (отклонитель)"), ("ϑ (°)", "ϕ (°)", "ψ (°)"),
+     ("Ι", "α", "β"), ("Inc", "φ", "ψ"), ("Inc", "Azi", "φ")],
+)  # fmt: skip
+def test_greek_letters_of_angles_in_minutes_are_told_by_the_readings(tmp_path, names):
+    """Whichever letter is which; codes of the same form beside the three are none of them."""
+    columns, exact = table(), {}
+    for name, angle in zip(names, ("Inc (deg)", "Azi (deg)", "TF (deg)"), strict=True):
+        columns[name], exact[angle] = in_minutes(columns.pop(angle))
+    columns["γ"] = [f"{1 + k // 8}-{1 + k % 8:02d}" for k in range(48)]
+    run = read(written(tmp_path / "a.csv", columns))
+    for name, angle in (("inclination", "Inc (deg)"), ("azimuth", "Azi (deg)"), ("toolface", "TF (deg)")):  # fmt: skip
+        assert np.degrees(run.reference(name)) == pytest.approx(exact[angle], abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["τ", "No", "Date of θ", "θx"])
+def test_other_cells_of_that_form_stay_what_they_are(tmp_path, name):
+    cells, _ = in_minutes(table()["Inc (deg)"])
+    proposal = library.propose_profile(written(tmp_path / "a.csv", table(**{name: cells})))
+    assert f"'{name} (°)'" not in findings_of(proposal).get("unused-columns", "")
+
+
+OTHERS_BESIDE = (
+    (("Field at observatory 50210 nT", "Field here 50123 nT"), "ref_field_nt", 50123, 50210),
+    (("Field today 50123 nT", "Field last year 50010 nT"), "ref_field_nt", 50123, 50010),
+    (("Calibrated at: Xian", "Field Beijing 54800 nT", "Field Xian 50123 nT"), "ref_field_nt", 50123, 54800),
+    (("Field (IGRF) 50210 nT", "Field measured at stand 50123 nT"), "ref_field_nt", 50123, 50210),
+    (("Dip here 66.12 deg", "Dip of customer 58.9 deg"), "ref_dip_deg", 66.12, 58.9),
+    (("Field here 50123 nT", "H 20300 nT", "Z 45800 nT"), "ref_field_nt", 50123, None),
+    (("Field here 50123 nT", "Field uncertainty 50 nT", "Field limits 49000 nT"), "ref_field_nt", 50123, None),
+    (("Field here 50.123 uT", "Mag sensitivity 50000 nT/V"), "ref_field_nt", 50123, None),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("lines", "column", "value", "other"), OTHERS_BESIDE)
+def test_of_two_references_the_one_that_is_not_taken_is_named(
+    tmp_path, lines, column, value, other
+):
+    """By its value; not what is no other reference of the same quantity."""
+    columns = table(ref_field_nt=None, ref_dip_deg=None, ref_gravity_g=None)
+    path = written(tmp_path / "a.csv", columns, *lines)
+    texts = [
+        f.text for f in library.propose_profile(path).findings if f.id == "reference-not-taken"
+    ]
+    named = [text for text in texts if text.startswith(f"{column}: {value} is taken")]
+    assert len(named) == (other is not None)
+    assert all(f"and not {other} of the line" in text for text in named)
+    known = read(path).reference(column.split("_")[1])
+    known = np.degrees(known) if "dip" in column else known
+    assert known == pytest.approx(np.full(48, value))
+
+
 @pytest.mark.parametrize("name", ["Dew point (C)", "Probe heat SD (C)", "Set point (C)"])
 def test_another_thing_in_degrees_celsius_is_no_temperature_of_the_tool(tmp_path, name):
     columns = {(name if n == "Temp (C)" else n): v for n, v in table().items()}

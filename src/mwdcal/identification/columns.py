@@ -568,7 +568,7 @@ _SURROUNDINGS = re.compile(
     r"камер|печ|термостат|воздух|空气|环境|烘箱|室温",
     re.IGNORECASE,
 )
-"""What the tool is in, and has a temperature of its own."""
+"""Surroundings of the tool, with a temperature of their own."""
 _OF_EQUIPMENT = re.compile(
     r"(?<![^\W\d_])(power|suppl(y|ies)|psu|netz(teil|ger(ä|ae)t)\w*|str(om|øm)(versorgung|forsyning)|fuente|fonte|alimenta\w*|"
     r"питани\w*|rack|cabinet|panel|p_?temp|logger|daq|dmm|multimeter|pc|computer|rechner|ordenador|компьютер\w*|"
@@ -576,7 +576,7 @@ _OF_EQUIPMENT = re.compile(
     r"наружн\w*|observatory|coils?|helmholtz\w*|check standard|golden|dummy)(?![^\W\d_])|电源|控制器|室外",
     re.IGNORECASE,
 )
-"""What stands beside the tool, or elsewhere, and has a temperature of its own."""
+"""Equipment with a temperature of its own, beside the tool or elsewhere."""
 _OF_OTHER_WARMTH = re.compile(
     r"(?<![^\W\d_])(sd|std|stdev|dev|sigma|unc|delta|diff|dew|rate|grad\w*|min|max|limit|range|offset|coeff\w*)(?![^\W\d_])",
     re.IGNORECASE,

@@ -1381,15 +1381,24 @@ def _apart(
     )
 
 
+_GREEK_ANGLE = re.compile(r"[ΘθϑΦφϕΨψΑαΒβΓγΙι](?![\u0370-\u03ffA-Za-z])")
+"""A letter that is an angle, and what says more of it in words of other alphabets or in brackets."""
+
+
 def _in_degrees(
     names: Sequence[str], units: Sequence[str], columns: Sequence[list[object]], said: str
 ) -> tuple[list[str], list[str], list[list[object]]]:
-    """The same with degrees, minutes and seconds of angles as degrees; lines `said` above may tell how they stand."""
+    """The same with degrees, minutes and seconds of angles as degrees; lines `said` above may tell how they stand.
+
+    Greek letters of angles do not say which; brackets behind them that do so stay.
+    """
     whole = [*zip(names, units, columns, strict=True)]
     for place, (name, unit, column) in enumerate(whole):
-        plain = _BRACKETS.sub("", name).strip()
+        greek = bool(_GREEK_ANGLE.match(name))
+        told = greek and resembled(spelled(name))
+        plain = name if told else _BRACKETS.sub("", name).strip()
         meant = resembled(spelled(plain))
-        if meant and (meant.column.endswith("_deg") or plain.lower() == "az"):
+        if greek or (meant and (meant.column.endswith("_deg") or plain.lower() == "az")):
             cells = figures.sexagesimal(column, f"{name} {unit} {said}")
             if cells != column:
                 whole[place] = (f"{plain} (°)", "", cells)
