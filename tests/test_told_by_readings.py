@@ -458,10 +458,11 @@ def test_a_name_that_messages_cut_or_quote_is_whole_in_the_option_that_takes_it(
 
 OF_OTHER_THINGS = (
     "Stand electronics (°C)", "Power supply (°C)", "PSU temp (C)", "Oven set point (°C)", "T_set (°C)", "PTemp_C",
-    "Logger temp (C)", "Turntable temp (C)", "Prüfstand (°C)", "Netzteil (°C)", "Темп. стенда (°C)", "Coil temp (C)",
+    "Logger temp (C)", "Netzteil (°C)", "Rack temp (C)", "Bench electronics (°C)", "Coil temp (C)",
 )  # fmt: skip
 AROUND = (
     "Oven temp (C)", "Room (°C)", "Ambient (°C)", "Lab (°C)", "Thermostat temp (C)", "Raumtemperatur (°C)",
+    "Turntable temp (C)", "Prüfstand Temperatur (°C)", "Темп. стенда (°C)",
 )  # fmt: skip
 
 

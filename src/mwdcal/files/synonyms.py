@@ -93,7 +93,7 @@ FACTORS = {
 _WARM = ("°C", "°F", "K")
 _MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss", "mG", "A/m")
 _GRAVITY_UNITS = ("g", "mg", "m/s²", "gal", "mGal", "ft/s²")
-_OF_CHANNELS = (*_MAGNETIC_UNITS, *_GRAVITY_UNITS)
+_CHANNEL_UNITS = (*_MAGNETIC_UNITS, *_GRAVITY_UNITS)
 _TESLAS = {"nt", "ut"}
 """Units that no temperature has, and those of them that are no other word within a name."""
 WARMTH = "temperature_c"
@@ -308,7 +308,7 @@ def resembled(name: str) -> Resemblance | None:
     if again and again.column == bare.column:
         return bare
     unit = unit_of(bracketed[2]) or bracketed[2].strip()
-    of_channel = bare.column == WARMTH and unit in _OF_CHANNELS  # Gx temp comp (g)
+    of_channel = bare.column == WARMTH and unit in _CHANNEL_UNITS  # Gx temp comp (g)
     return None if behind or of_channel else bare._replace(unit=unit)
 
 
@@ -323,7 +323,7 @@ def _resembled(name: str) -> Resemblance | None:
     column = _column(whole, bare, set(words), unit)
     if column is None and _is_warmth(every, whole):
         column = WARMTH
-    if column == WARMTH and (unit in _OF_CHANNELS or not _TESLAS.isdisjoint(every)):
+    if column == WARMTH and (unit in _CHANNEL_UNITS or not _TESLAS.isdisjoint(every)):
         return None
     if column is None or (unit == "counts" and column not in _CHANNELS):
         return None

@@ -154,12 +154,14 @@ def is_computed(name: str) -> bool:
 
 
 def is_of_surroundings(name: str) -> bool:
-    """Whether a column is called the temperature of an oven or a room.
+    """Whether a column is called the temperature of an oven, a room or the stand.
 
-    >>> is_of_surroundings("Oven temp"), is_of_surroundings("Temp")
-    (True, False)
+    >>> [is_of_surroundings(name) for name in ("Oven temp", "Turntable temp", "Temp", "Tool in stand")]
+    [True, True, False, False]
     """
-    return bool(_SURROUNDINGS.search(name))
+    text = f"{name}, {spelled(name)}"
+    of_stand = _BY_STAND.search(text) and not _BY_TOOL.search(text)
+    return bool(_SURROUNDINGS.search(name) or of_stand)
 
 
 def is_not_of_tool(name: str) -> bool:
@@ -169,7 +171,8 @@ def is_not_of_tool(name: str) -> bool:
     [True, True, True, False, False]
     """
     text = f"{name}, {spelled(name)}"
-    other = _BY_STAND.search(text) or _OF_EQUIPMENT.search(text) or _is_nominal(name)
+    of_stand = _BY_STAND.search(text) and "electronic" in text
+    other = of_stand or _OTHER_EQUIPMENT.search(text) or _is_nominal(name)
     return bool(other) and not _BY_TOOL.search(text)
 
 
@@ -569,7 +572,7 @@ _SURROUNDINGS = re.compile(
     re.IGNORECASE,
 )
 """Surroundings of the tool, with a temperature of their own."""
-_OF_EQUIPMENT = re.compile(
+_OTHER_EQUIPMENT = re.compile(
     r"(?<![^\W\d_])(power|suppl(y|ies)|psu|netz(teil|ger(ä|ae)t)\w*|str(om|øm)(versorgung|forsyning)|fuente|fonte|alimenta\w*|"
     r"питани\w*|rack|cabinet|panel|p_?temp|logger|daq|dmm|multimeter|pc|computer|rechner|ordenador|компьютер\w*|"
     r"controller|regler|steuerung|контроллер\w*|motor|amplifier|heat ?sink|outside|outdoors?|exterior|au(ß|ss)en\w*|"
@@ -1146,7 +1149,8 @@ class Questions(list[QuestionError]):
         ]
 
     def raise_any(self, source: str) -> None:
-        """Raise all questions together."""
+        """Raise all questions together, of channels side by side the one that answers others."""
+        self.settle(SIDE_BY_SIDE)
         if self:
             raise QuestionsError(source, [*{str(each): each for each in self}.values()])
 
@@ -1209,7 +1213,6 @@ def proposed(
         questions.ask(_check_nameless, others, values, chosen, known, source)
     present = {*chosen, *said, *known, *of_vectors(chosen)}
     _ask_lacking(present, every, meanings, values, questions, source)
-    questions.settle(SIDE_BY_SIDE)
     questions.raise_any(source)
     by_value = {c for c, each in chosen.items() if each.unit and not meanings[each.name].unit}
     used = {each.name for each in chosen.values()}
@@ -1406,10 +1409,10 @@ def _tell_temperature(
     others = {n: unit for n, unit in zip(names, units, strict=True) if n not in meanings}
     lone = [n for n, unit in others.items() if _BARE_T.fullmatch(f"{n} {unit}".strip())]
     warm = {} if lone else {n: w for n, unit in others.items() if (w := warm_unit(n, unit))}
-    own = {n: unit for n, unit in warm.items() if not is_not_of_tool(n)}
-    lone += [n for n, unit in own.items() if unit == "°C" and not is_of_surroundings(n)]
-    clear = len(lone) == 1 >= len(own)
-    for name in lone if clear else () if own else warm:  # of which it is asked
+    of_tool = {n: unit for n, unit in warm.items() if not is_not_of_tool(n)}
+    lone += [n for n, unit in of_tool.items() if unit == "°C" and not is_of_surroundings(n)]
+    clear = len(lone) == 1 >= len(of_tool)
+    for name in lone if clear else () if of_tool else warm:  # of which it is asked
         cells = values(name)
         if cells is None or (warm and not np.isfinite(cells).all()):
             continue

@@ -347,13 +347,13 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     return name, LENGTH_UNITS[unit]
 
 
-def check_path(lacking: str, **asked: object) -> None:
+def check_path(lacking: str, **options: object) -> None:
     """Refuse an option on positions where there are none; `lacking`: what a path lacks, blank where there is one.
 
     Raises:
         InputError: positions are asked for, and there are none.
     """
-    names = [name for name, value in asked.items() if value]
+    names = [name for name, value in options.items() if value]
     if lacking and names:
         why = lacking.removeprefix("no well path: ")
         raise InputError(f"`{names[0]}` needs a well path, which these surveys do not have: {why}")

@@ -170,7 +170,7 @@ def command(
     from mwdcal.presentation.signature import load_calibration
     from mwdcal.survey import long_table
     from mwdcal.survey.runs import survey_runs
-    from mwdcal.survey.surveying import analysed, check_drift, check_path
+    from mwdcal.survey.surveying import analysed, check_drift
 
     if msa_html and (not msa or run):
         raise InputError("`msa_html` goes with `msa` of one run. Leave it out, or add `msa`.")
@@ -180,8 +180,7 @@ def command(
     options.check_outputs([output, msa_html, contributions, listing], given, page=report)
     unit = length_unit or ""
     start, ends = _tie_in(tie_in, unit), _switch(switch)
-    loaded = [load_calibration(tool, key) for tool, _ in pairs]
-    said = options.said(decimal)
+    loaded, said = [load_calibration(tool, key) for tool, _ in pairs], options.said(decimal)
     wanted = report, contributions, listing, station, covariance, said.statements, said.answers
     whole = any((msa, axial_correction, missing == "blank", run, registry, *wanted))
     if not whole and long_table.in_parts(readings, output, loaded[0].calibration.profile):
@@ -201,14 +200,7 @@ def command(
     _check_analyses(inputs, analyses, loaded, pages, report, as_json)
     way: Any = {"tie_in": start, "switch": ends, "outside": outside, "axial": axial_correction}
     result = survey_runs(inputs, analyses, **way)
-    lacking = next((each.text for each in result.well.findings if each.id == "no-path"), "")
-    check_path(
-        lacking,
-        tie_in=tie_in,
-        section_azimuth=section_azimuth,
-        covariance=covariance,
-        listing=listing,
-    )
+    _check_positions(result, tie_in, section_azimuth, covariance, listing)
     pages += _pages(result, report, contributions, station) + _listing(result, listing)
     atomic.write_all([_table(result, output, covariance), *pages])
     files, more = (
@@ -278,6 +270,17 @@ def _listing(result: SurveyedWell, file: Path | None) -> Outputs:
     from mwdcal.presentation.listing import listing
 
     return [(file, tables.rendered(file, listing(result)))]
+
+
+def _check_positions(
+    result: SurveyedWell, tie_in: str | None, section: float, covariance: bool, listing: Path | None
+) -> None:
+    """Refuse options on positions of a well that has none."""
+    from mwdcal.survey.surveying import check_path
+
+    lacking = next((each.text for each in result.well.findings if each.id == "no-path"), "")
+    options_on_path = {"section_azimuth": section, "covariance": covariance, "listing": listing}
+    check_path(lacking, tie_in=tie_in, **options_on_path)
 
 
 def _interference_page(

@@ -1395,8 +1395,8 @@ def _in_degrees(
     whole = [*zip(names, units, columns, strict=True)]
     for place, (name, unit, column) in enumerate(whole):
         greek = bool(_GREEK_ANGLE.match(name))
-        told = greek and resembled(spelled(name))
-        plain = name if told else _BRACKETS.sub("", name).strip()
+        whole_name = greek and resembled(spelled(name))
+        plain = name if whole_name else _BRACKETS.sub("", name).strip()
         meant = resembled(spelled(plain))
         if greek or (meant and (meant.column.endswith("_deg") or plain.lower() == "az")):
             cells = figures.sexagesimal(column, f"{name} {unit} {said}")
