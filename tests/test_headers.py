@@ -601,6 +601,38 @@ def test_one_question_asks_which_of_two_tools_side_by_side_is_meant(tmp_path):
     }
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "warm", "taken"),
+    [
+        ("DUT", "Check standard", "Temp (C)", ["DUT Temp (C)", "Check standard Temp (C)"]),
+        ("DUT", "check std", "T (°C)", ["DUT T (°C)", "check std T (°C)"]),
+        ("DUT SN 118", "Check standard", "T C", ["DUT SN 118 T C", "Check standard T C"]),
+        ("Bloco A", "Bloco B (padrão)", "T (°C)", ["Bloco A T (°C)", "Bloco B (padrão) T (°C)"]),
+        ("DUT", "Golden tool", "Sensor temp (C)", ["DUT Sensor temp (C)", "Golden tool Sensor temp (C)"]),
+        ("DUT", "Check standard", "", ["DUT Temp (C)", ""]),
+    ],
+)  # fmt: skip
+def test_of_a_tool_beside_a_check_standard_one_question_asks(tmp_path, first, second, warm, taken):
+    """Its answers take the temperature of each: of the one that has none, beside one that has, no other's."""
+    rows = [
+        [*row, *(1.02 * cell + 0.0007 * (-1) ** n for cell in row[3:9]), row[9] + 1]
+        for n, row in enumerate(stations())
+    ]
+    names = [f"{first} {end}" for end in [*CHANNELS, warm or "Temp (C)"]]
+    names += [f"{second} {end}" for end in [*CHANNELS, *filter(None, [warm])]]
+    head = ["Inc", "Azi", "TF", *names]
+    path = text(tmp_path / "run.csv", [*TITLES, head, *(row[: len(head)] for row in rows)])
+    with pytest.raises(mwdcal.FitError, match="2 tools stand side by side") as error:
+        mwdcal.propose_profile(path)
+    (question,) = error.value.questions
+    answers = [
+        dict(text.split("=") for name, text in each.arguments if name == "column")
+        for each in question.answers
+    ]
+    assert [each["az"] for each in answers] == [f"{first} Gz", f"{second} Gz"]
+    assert [each["temperature_c"] for each in answers] == taken
+
+
 def pairs_of_channels(first, second, name):
     """A table of channels as measured and, behind them, corrected: in other values, under these words."""
     names = [*NAMES[:3], *(name.format(word, end) for word in (first, second) for end in CHANNELS)]

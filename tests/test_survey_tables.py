@@ -343,6 +343,49 @@ def test_a_table_without_a_depth_by_its_name_names_the_option_and_what_may_be_it
         assert not {"pump", "flow", "Date", "NAME", "Svy"} & {*line.replace("'", " ").split()}
 
 
+POSITIONS = (
+    ("--tie-in", "0,0,0"), ("--tie-in", "0,0,0,1,2,3"), ("--section-azimuth", "30"), ("--covariance",),
+    ("--listing", "list.csv"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("option", POSITIONS)
+def test_positions_that_are_asked_for_and_cannot_be_are_refused(tmp_path, laboratory, option):
+    """Nothing is written then; with the depths named, or none of these options, it is."""
+    path = text_table(tmp_path / "WELL.csv", deep("Strekning", METRES))
+    out, *option = (
+        tmp_path / "out.csv",
+        *option[:1],
+        *(tmp_path / o if o.endswith("csv") else o for o in option[1:]),
+    )
+    ran = cli("survey", laboratory[0], path, "-o", out, *option)
+    assert f"{option[0]} needs a well path" in refused(ran, 2)
+    assert '--column "md_m=Strekning"' in ran.err
+    assert not out.exists()
+    ran = cli("survey", laboratory[0], path, "-o", out, *option, "--column", "md_m=Strekning")
+    assert ran.code == 0, ran
+
+
+def test_a_well_without_positions_says_so_first(tmp_path, laboratory):
+    """Before surveys that nothing judges, and in the first line of the screen."""
+    table = {n: each for n, each in deep("gone", METRES).items() if n != "gone"}
+    bare = {n: each for n, each in table.items() if n not in ("Gtotal", "Btotal", "Dip")}
+    for columns in (table, bare):
+        ran = cli(
+            "survey",
+            laboratory[0],
+            text_table(tmp_path / "WELL.csv", columns),
+            "-o",
+            tmp_path / "out.csv",
+        )
+        assert ran.code == 0
+        assert "no positions" in ran.out.splitlines()[0]
+        first = next(line for line in ran.err.splitlines() if line.startswith("!"))
+        assert first.startswith("! no well path: no column has the measured depth.")
+    path = text_table(tmp_path / "WELL.csv", deep("MD (m)", METRES))
+    assert "no positions" not in cli("survey", laboratory[0], path, "-o", tmp_path / "out.csv").out
+
+
 @pytest.mark.parametrize(("name", "unit"), [("Strekning (ft)", ""), ("Strekning", "m")])
 def test_a_column_in_a_unit_of_length_is_offered_alone(tmp_path, laboratory, name, unit):
     rising = {"ticks": ("", np.arange(len(METRES)) * 5.0)}

@@ -1106,6 +1106,19 @@ def test_other_names_are_none_of_them(tmp_path, name):
         assert unused == [f"columns not used: '{name}'."]
 
 
+@pytest.mark.parametrize("above", [(), ("Serial,4711",)])
+def test_a_first_column_headed_by_its_sign_alone_is_called_so(tmp_path, above):
+    """As rows are numbered below '#': no message calls it 'column 1', which is for a heading without a name."""
+    for heading, called in (("#", "#"), ("", "column 1"), ("# Shot", "Shot")):
+        columns = {heading: np.arange(1, 49) % 7, **table()}
+        del columns["Pos"]
+        path = written(tmp_path / "a.csv", columns, *above)
+        proposal = library.propose_profile(path)
+        unused = findings_of(proposal).get("unused-columns", "")
+        taken = {source.name for source in proposal.profile.columns.values()}
+        assert called in taken or unused == f"columns not used: '{called}'."
+
+
 def test_units_that_contradict_each_other_are_both_named(tmp_path):
     columns = {("Btotal (µT)" if n == "Btotal (nT)" else n): v for n, v in table().items()}
     units = {"Btotal (µT)": "nT", "Gx (V)": "V", "Gy (V)": "V", "Gz (V)": "V"}

@@ -440,6 +440,136 @@ def test_a_column_in_a_unit_of_temperatures_is_named_with_the_option_that_takes_
     assert "--column" not in taken.err
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["Heat at the end of the probe, by the sensor of March (C)", "'Probe heat' (C)"],
+)
+def test_a_name_that_messages_cut_or_quote_is_whole_in_the_option_that_takes_it(tmp_path, name):
+    columns = table() | {name: np.asarray(table()["Temp (C)"]), "Heat (C)": np.full(48, 20.0)}
+    del columns["Temp (C)"]
+    said = findings_of(library.propose_profile(written(tmp_path / "a.csv", columns)))
+    del columns["Heat (C)"]
+    columns[name][0] = np.nan
+    columns[name] = ["" if cell != cell else cell for cell in columns[name].tolist()]
+    alone = findings_of(library.propose_profile(written(tmp_path / "b.csv", columns)))
+    assert f"'temperature_c={name}'" in alone["temperature-by-unit"]
+    assert "temperature-by-unit" in said
+
+
+OF_OTHER_THINGS = (
+    "Stand electronics (°C)", "Power supply (°C)", "PSU temp (C)", "Oven set point (°C)", "T_set (°C)", "PTemp_C",
+    "Logger temp (C)", "Netzteil (°C)", "Rack temp (C)", "Bench electronics (°C)", "Coil temp (C)",
+)  # fmt: skip
+AROUND = (
+    "Oven temp (C)", "Room (°C)", "Ambient (°C)", "Lab (°C)", "Thermostat temp (C)", "Raumtemperatur (°C)",
+    "Turntable temp (C)", "Prüfstand Temperatur (°C)", "Темп. стенда (°C)",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OF_OTHER_THINGS)
+def test_the_temperature_of_another_thing_is_asked_about_and_never_before_one_of_the_tool(
+    tmp_path, name
+):
+    """Alone it is asked about; beside an oven's that is taken, and beside the tool's this."""
+    columns = table()
+    warm = np.asarray(columns.pop("Temp (C)"))
+    path = written(tmp_path / "a.csv", columns | {name: warm})
+    with pytest.raises(FitError, match="not the temperature of the tool, and no other") as error:
+        library.propose_profile(path)
+    (question,) = error.value.questions
+    assert [each.arguments[0][1] for each in question.answers] == [
+        "temperature_c=",
+        f"temperature_c={name}",
+    ]
+    assert read(path, column=f"temperature_c={name}").temperature == pytest.approx(warm)
+    assert read(path, column="temperature_c=").temperature is None
+    for other in ("Oven temp (C)", "Tool temp (C)", "Board temp (C)"):
+        beside = columns | {name: warm + 3, other: warm}
+        assert read(written(tmp_path / "b.csv", beside)).temperature == pytest.approx(warm), other
+
+
+@pytest.mark.parametrize("name", AROUND)
+def test_what_is_around_the_tool_has_its_temperature_where_nothing_else_has(tmp_path, name):
+    columns = table()
+    warm = np.asarray(columns.pop("Temp (C)"))
+    proposal = library.propose_profile(written(tmp_path / "a.csv", columns | {name: warm}))
+    assert proposal.profile.columns["temperature_c"].name == name
+    assert f"{name!r} is taken" in findings_of(proposal)["oven-temperature"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["Gx temp comp (g)", "Temp comp Hx (nT)", "Bx (nT) temp corrected", "Temp X (g)", "Tmep (g)", "Tool T (uT)",
+     "Sensor temp (m/s2)", "Temperatur (mG)"],
+)  # fmt: skip
+def test_a_channel_in_units_of_gravity_or_field_is_no_temperature(tmp_path, name):
+    """Not beside one, nor where the table has none."""
+    columns = table() | {name: np.asarray(table()["Hx (V)"])}
+    assert read(written(tmp_path / "a.csv", columns)).temperature == pytest.approx(
+        np.asarray(columns.pop("Temp (C)"))
+    )
+    assert read(written(tmp_path / "b.csv", columns)).temperature is None
+
+
+def in_minutes(angles):
+    """Angles as degrees and minutes: 13-59."""
+    minutes = [round(60 * angle) for angle in np.asarray(angles)]
+    return [f"{each // 60}-{each % 60:02d}" for each in minutes], np.array(minutes) / 60
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("θ", "φ", "ψ"), ("θ", "ψ", "φ"), ("Θ", "Φмагн", "Ψ (отклонитель)"), ("ϑ (°)", "ϕ (°)", "ψ (°)"),
+     ("Ι", "α", "β"), ("Inc", "φ", "ψ"), ("Inc", "Azi", "φ")],
+)  # fmt: skip
+def test_greek_letters_of_angles_in_minutes_are_told_by_the_readings(tmp_path, names):
+    """Whichever letter is which; codes of the same form beside the three are none of them."""
+    columns, exact = table(), {}
+    for name, angle in zip(names, ("Inc (deg)", "Azi (deg)", "TF (deg)"), strict=True):
+        columns[name], exact[angle] = in_minutes(columns.pop(angle))
+    columns["γ"] = [f"{1 + k // 8}-{1 + k % 8:02d}" for k in range(48)]
+    run = read(written(tmp_path / "a.csv", columns))
+    for name, angle in (("inclination", "Inc (deg)"), ("azimuth", "Azi (deg)"), ("toolface", "TF (deg)")):  # fmt: skip
+        assert np.degrees(run.reference(name)) == pytest.approx(exact[angle], abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["τ", "No", "Date of θ", "θx"])
+def test_other_cells_of_that_form_stay_what_they_are(tmp_path, name):
+    cells, _ = in_minutes(table()["Inc (deg)"])
+    proposal = library.propose_profile(written(tmp_path / "a.csv", table(**{name: cells})))
+    assert f"'{name} (°)'" not in findings_of(proposal).get("unused-columns", "")
+
+
+OTHERS_BESIDE = (
+    (("Field at observatory 50210 nT", "Field here 50123 nT"), "ref_field_nt", 50123, 50210),
+    (("Field today 50123 nT", "Field last year 50010 nT"), "ref_field_nt", 50123, 50010),
+    (("Calibrated at: Xian", "Field Beijing 54800 nT", "Field Xian 50123 nT"), "ref_field_nt", 50123, 54800),
+    (("Field (IGRF) 50210 nT", "Field measured at stand 50123 nT"), "ref_field_nt", 50123, 50210),
+    (("Dip here 66.12 deg", "Dip of customer 58.9 deg"), "ref_dip_deg", 66.12, 58.9),
+    (("Field here 50123 nT", "H 20300 nT", "Z 45800 nT"), "ref_field_nt", 50123, None),
+    (("Field here 50123 nT", "Field uncertainty 50 nT", "Field limits 49000 nT"), "ref_field_nt", 50123, None),
+    (("Field here 50.123 uT", "Mag sensitivity 50000 nT/V"), "ref_field_nt", 50123, None),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("lines", "column", "value", "other"), OTHERS_BESIDE)
+def test_of_two_references_the_one_that_is_not_taken_is_named(
+    tmp_path, lines, column, value, other
+):
+    """By its value; not what is no other reference of the same quantity."""
+    columns = table(ref_field_nt=None, ref_dip_deg=None, ref_gravity_g=None)
+    path = written(tmp_path / "a.csv", columns, *lines)
+    texts = [
+        f.text for f in library.propose_profile(path).findings if f.id == "reference-not-taken"
+    ]
+    named = [text for text in texts if text.startswith(f"{column}: {value} is taken")]
+    assert len(named) == (other is not None)
+    assert all(f"and not {other} of the line" in text for text in named)
+    known = read(path).reference(column.split("_")[1])
+    known = np.degrees(known) if "dip" in column else known
+    assert known == pytest.approx(np.full(48, value))
+
+
 @pytest.mark.parametrize("name", ["Dew point (C)", "Probe heat SD (C)", "Set point (C)"])
 def test_another_thing_in_degrees_celsius_is_no_temperature_of_the_tool(tmp_path, name):
     columns = {(name if n == "Temp (C)" else n): v for n, v in table().items()}

@@ -93,6 +93,9 @@ FACTORS = {
 _WARM = ("°C", "°F", "K")
 _MAGNETIC_UNITS = ("nT", "µT", "mT", "gauss", "mG", "A/m")
 _GRAVITY_UNITS = ("g", "mg", "m/s²", "gal", "mGal", "ft/s²")
+_CHANNEL_UNITS = (*_MAGNETIC_UNITS, *_GRAVITY_UNITS)
+_TESLAS = {"nt", "ut"}
+"""Units that no temperature has, and those of them that are no other word within a name."""
 WARMTH = "temperature_c"
 _STATED = {"ref", "reference", "local", "model", "igrf", "bggm", "wmm"}
 """Words of columns that are known, not measured."""
@@ -304,7 +307,9 @@ def resembled(name: str) -> Resemblance | None:
     again = _resembled(bracketed[2])  # Roll angle (TF): no unit
     if again and again.column == bare.column:
         return bare
-    return None if behind else bare._replace(unit=unit_of(bracketed[2]) or bracketed[2].strip())
+    unit = unit_of(bracketed[2]) or bracketed[2].strip()
+    of_channel = bare.column == WARMTH and unit in _CHANNEL_UNITS  # Gx temp comp (g)
+    return None if behind or of_channel else bare._replace(unit=unit)
 
 
 def _resembled(name: str) -> Resemblance | None:
@@ -317,7 +322,9 @@ def _resembled(name: str) -> Resemblance | None:
     bare = "".join(word for word in words if word not in _BYWORDS)
     column = _column(whole, bare, set(words), unit)
     if column is None and _is_warmth(every, whole):
-        column = "temperature_c"
+        column = WARMTH
+    if column == WARMTH and (unit in _CHANNEL_UNITS or not _TESLAS.isdisjoint(every)):
+        return None
     if column is None or (unit == "counts" and column not in _CHANNELS):
         return None
     if column in _CALLED_G and unit == "g" and name.rstrip(" )]").endswith("G"):

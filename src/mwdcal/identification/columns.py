@@ -49,6 +49,9 @@ from mwdcal.sensor.profile import ColumnSource
 
 MEASURED_BY_TOOL = "the tool has measured"
 """In questions on angles that fit the readings whatever the stand shows."""
+SIDE_BY_SIDE = "stand side by side"
+OF_SEVERAL_TOOLS = f"tools {SIDE_BY_SIDE}"
+"""In questions on channels below several titles, and on those of several tools, whatever the readings fit."""
 BOTH_UNITS = " and "
 """What stands between two units of one column, of which one is wrong."""
 IN_BRACKETS = re.compile(r"[(\[]([^)\]]*)[)\]]\s*$")
@@ -151,12 +154,26 @@ def is_computed(name: str) -> bool:
 
 
 def is_of_surroundings(name: str) -> bool:
-    """Whether a column is called the temperature of an oven or a room.
+    """Whether a column is called the temperature of an oven, a room or the stand.
 
-    >>> is_of_surroundings("Oven temp"), is_of_surroundings("Temp")
-    (True, False)
+    >>> [is_of_surroundings(name) for name in ("Oven temp", "Turntable temp", "Temp", "Tool in stand")]
+    [True, True, False, False]
     """
-    return bool(_SURROUNDINGS.search(name))
+    text = f"{name}, {spelled(name)}"
+    of_stand = _BY_STAND.search(text) and not _BY_TOOL.search(text)
+    return bool(_SURROUNDINGS.search(name) or of_stand)
+
+
+def is_not_of_tool(name: str) -> bool:
+    """Whether a column is called the temperature of other equipment, or one that was set.
+
+    >>> [is_not_of_tool(n) for n in ("Stand electronics", "Oven set point", "PTemp", "Tool in stand", "Electronics")]
+    [True, True, True, False, False]
+    """
+    text = f"{name}, {spelled(name)}"
+    of_stand = _BY_STAND.search(text) and "electronic" in text
+    other = of_stand or _OTHER_EQUIPMENT.search(text) or _is_nominal(name)
+    return bool(other) and not _BY_TOOL.search(text)
 
 
 def warm_unit(name: str, unit: str) -> str:
@@ -550,11 +567,19 @@ _SPOKEN_WARMTH = {
 }
 """Units of temperatures in a line above a table, not those of a number."""
 _SURROUNDINGS = re.compile(
-    r"oven|chamber|ambient|panel|logger|(?<![a-z])p_?temp(?![a-z])|kamer\b|(?<![a-z])(air|aire|ar|luft|room|bath|lab)(?![a-z])|ofen|kammer|sala|habitaci|oficina|umgebung|raum|ovn|rom|horno|ambiente|"
+    r"oven|chamber|ambient|thermostat|kamer\b|(?<![a-z])(air|aire|ar|luft|room|bath|lab(or\w*)?)(?![a-z])|ofen|kammer|sala|habitaci|oficina|umgebung|raum|ovn|rom|horno|ambiente|"
     r"камер|печ|термостат|воздух|空气|环境|烘箱|室温",
     re.IGNORECASE,
 )
-"""What has a temperature of its own that is not the tool's."""
+"""Surroundings of the tool, with a temperature of their own."""
+_OTHER_EQUIPMENT = re.compile(
+    r"(?<![^\W\d_])(power|suppl(y|ies)|psu|netz(teil|ger(ä|ae)t)\w*|str(om|øm)(versorgung|forsyning)|fuente|fonte|alimenta\w*|"
+    r"питани\w*|rack|cabinet|panel|p_?temp|logger|daq|dmm|multimeter|pc|computer|rechner|ordenador|компьютер\w*|"
+    r"controller|regler|steuerung|контроллер\w*|motor|amplifier|heat ?sink|outside|outdoors?|exterior|au(ß|ss)en\w*|"
+    r"наружн\w*|observatory|coils?|helmholtz\w*|check standard|golden|dummy)(?![^\W\d_])|电源|控制器|室外",
+    re.IGNORECASE,
+)
+"""Equipment with a temperature of its own, beside the tool or elsewhere."""
 _OF_OTHER_WARMTH = re.compile(
     r"(?<![^\W\d_])(sd|std|stdev|dev|sigma|unc|delta|diff|dew|rate|grad\w*|min|max|limit|range|offset|coeff\w*)(?![^\W\d_])",
     re.IGNORECASE,
@@ -739,6 +764,7 @@ def meanings_of(
         for name, unit in zip(names, units, strict=True)
         if (m := meaning(once[name], unit))
         and not (m.column in RAW and m.unit in ("°", "rad", "gon"))
+        and not (m.column == WARMTH and m.unit in _OF_UNITS)
     }
     results = _by_legend(names, above) | results | _explained(names, above)
     results |= _behind_titles(names, units, results)
@@ -1110,8 +1136,8 @@ class Questions(list[QuestionError]):
         """Whether there is a question with one of some texts in it."""
         return any(text in each.text for each in self for text in texts)
 
-    def settle(self, words: str) -> bool:
-        """Whether there is a question of these words; others on columns that each of its answers takes are left out."""
+    def settle(self, words: str) -> None:
+        """Leave out questions on columns that each answer to a question of these words takes."""
         question = next((each for each in self if words in each.text), None)
         taken = [_columns_of(each) for each in question.answers] if question else []
         self[:] = [
@@ -1121,10 +1147,10 @@ class Questions(list[QuestionError]):
             or not (taken and each.answers)
             or not set[str]().union(*map(_columns_of, each.answers)) <= set.intersection(*taken)
         ]
-        return question is not None
 
     def raise_any(self, source: str) -> None:
-        """Raise all questions together."""
+        """Raise all questions together, of channels side by side the one that answers others."""
+        self.settle(SIDE_BY_SIDE)
         if self:
             raise QuestionsError(source, [*{str(each): each for each in self}.values()])
 
@@ -1179,7 +1205,7 @@ def proposed(
     angles = {c: chosen[c].name for c in _ANGLES_AND_WARMTH[:3] if c in chosen and c not in said}
     for column in angles:
         questions.ask(_check_nominal, column, angles, names, values, source)
-    beside = questions.settle("side by side") or questions.hold("channels of the magnetometer")
+    beside = questions.hold(SIDE_BY_SIDE, "channels of the magnetometer")
     if not beside and not {*RAW[3:]} & {*chosen, *said}:
         # Without accelerometers either triad may be either.
         believed = questions.believed() if {*RAW[:3]} & {*chosen} else ()
@@ -1259,8 +1285,10 @@ def _chosen(
         damaged = [problems[n] for n in alike if n in problems]
         if damaged and not _stated_among(candidates):
             questions += damaged
-        name = questions.ask(_one, column, candidates, values, source) if candidates else None
-        if name:
+        answered = candidates[0] if candidates and column in said else ""
+        if not answered and candidates:
+            answered = questions.ask(_one, column, candidates, values, source)
+        if name := answered:
             stated = meanings[name].unit or _angles(column, spoken)
             stated = stated or (warmth if column == WARMTH else "")
             cells = values(name)
@@ -1381,14 +1409,16 @@ def _tell_temperature(
     others = {n: unit for n, unit in zip(names, units, strict=True) if n not in meanings}
     lone = [n for n, unit in others.items() if _BARE_T.fullmatch(f"{n} {unit}".strip())]
     warm = {} if lone else {n: w for n, unit in others.items() if (w := warm_unit(n, unit))}
-    lone += [n for n, unit in warm.items() if unit == "°C" and not is_of_surroundings(n)]
-    cells = values(lone[0]) if len(lone) == 1 >= len(warm) else None
-    if warm and cells is not None and not np.isfinite(cells).all():
-        return
-    known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
-    known = known[~is_filler(known)]
-    if known.size and np.all((known >= -60) & (known <= 500)) and not is_numbering(known):
-        meanings[lone[0]] = Resemblance(WARMTH, warm.get(lone[0], ""))
+    of_tool = {n: unit for n, unit in warm.items() if not is_not_of_tool(n)}
+    lone += [n for n, unit in of_tool.items() if unit == "°C" and not is_of_surroundings(n)]
+    clear = len(lone) == 1 >= len(of_tool)
+    for name in lone if clear else () if of_tool else warm:  # of which it is asked
+        cells = values(name)
+        if cells is None or (warm and not np.isfinite(cells).all()):
+            continue
+        known = cells[np.isfinite(cells) & ~is_filler(cells)]
+        if known.size and np.all((known >= -60) & (known <= 500)) and not is_numbering(known):
+            meanings[name] = Resemblance(WARMTH, warm.get(name, ""))
 
 
 def _tell_references(
@@ -1562,6 +1592,7 @@ def _check_lacking(
         and (n in shows or not is_of_tool(n) or _is_whole(cells))
         and _may_be_in_a_unit(column, cells)
         and _may_hold(column, cells)
+        and not (column == WARMTH and _unit_beside(n, others[n]) in _OF_UNITS)
         and not _is_total(column, cells, "", names, values)
     }
     named = [n for n in numbers if _ends_as(n, column)]
@@ -1654,7 +1685,7 @@ def _check_triads(
     others = [n for n in names if n not in {each.name for each in chosen.values()}]
     listed = f"the names are {', '.join(map(shown, names[:20]))}"
     if {*RAW[:3]}.isdisjoint(chosen):
-        _check_side_by_side(others, values, source)
+        _check_side_by_side(names, values, source)
         raise QuestionError(
             f"{source}: could not tell which columns are the accelerometers ({', '.join(RAW[:3])}); {listed}.",
             triples_for(RAW[:3], others, values, OF_ONE_SPHERE)
@@ -1679,33 +1710,50 @@ def _check_triads(
 
 
 def _check_side_by_side(names: Sequence[str], values: Values, source: str) -> None:
-    """Ask which of several tools is meant whose channels stand side by side, each under the tool's own title."""
+    """Ask which of several tools is meant whose channels stand side by side, each under the tool's own title.
+
+    An answer takes the tool's temperature too; of a tool without one, beside another that has one, none. A run beside
+    its roll test is of one tool.
+    """
     tools: dict[str, dict[str, str]] = {}
     for name in names:
         words = name.split()
         for place in range(len(words) - 1, 0, -1):
-            rest = " ".join(words[place:])
-            alike = Resemblance(WARMTH) if _BARE_T.fullmatch(rest) else meaning(rest)
-            if alike and alike.column in (*RAW, WARMTH):
+            alike = meaning(" ".join(words[place:]))
+            if alike and alike.column in RAW:
                 tools.setdefault(" ".join(words[:place]), {})[alike.column] = name
                 break
     whole = {title: each for title, each in tools.items() if {*RAW[:3]} <= {*each}}
+    of_one = any(OF_CHECKS.search(title) and OF_ROLLS.search(title) for title in whole)
+    warm = {} if of_one else {title: _warmth_below(title, names) for title in whole}
+    beside = f"a run and its test {SIDE_BY_SIDE}" if of_one else f"{len(whole)} {OF_SEVERAL_TOOLS}"
     if len(whole) > 1:
         answers = [
             Answer(
                 with_values(title, values, each["ax"]),
                 (
                     *(("column", f"{column}={name}") for column, name in each.items()),
+                    *([("column", f"{WARMTH}={warm[title]}")] if any(warm.values()) else []),
                     *(("serial", str(s)) for s in [titles([[title]]).metadata.get("serial")] if s),
                 ),
             )
             for title, each in whole.items()
         ]
         raise QuestionError(
-            f"{source}: the channels of {len(whole)} tools stand side by side: {', '.join(map(shown, whole))}. Which "
-            "one is meant?",
+            f"{source}: the channels of {beside}: {', '.join(map(shown, whole))}. Which one is meant?",
             answers,
         )
+
+
+def _warmth_below(title: str, names: Sequence[str]) -> str:
+    """The one column that is called a temperature behind the title of a tool; empty where none or several are."""
+    behind = {n: n[len(title) :].strip() for n in names if n.startswith(f"{title} ")}
+    warm = [
+        n
+        for n, text in behind.items()
+        if _BARE_T.fullmatch(text) or ((alike := meaning(text)) and alike.column == WARMTH)
+    ]
+    return warm[0] if len(warm) == 1 else ""
 
 
 def _check_hidden(
@@ -1862,8 +1910,7 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
     if column in candidates:
         return column
     if column == WARMTH:
-        of_tool = [n for n in candidates if not is_of_surroundings(n)] or candidates
-        candidates = [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
+        candidates = _nearest(candidates, values, source)
     stated = [name for name in candidates if _CALLED_REFERENCE.search(spelled(name))]
     shows = [name for name in candidates if _is_shown(name) and not _is_nominal(name)]
     others = [name for name in candidates if name not in shows]
@@ -1883,6 +1930,19 @@ def _one(column: str, candidates: Sequence[str], values: Values, source: str) ->
         f"{source}: {' and '.join(map(shown, candidates))} may each be {of}. {advice}",
         candidates_for(column, candidates, values),
     )
+
+
+def _nearest(candidates: Sequence[str], values: Values, source: str) -> Sequence[str]:
+    """Of temperatures those of the tool, else those around it; a question where all are of something else."""
+    beside = [n for n in candidates if not is_not_of_tool(n)]
+    if not beside:
+        raise QuestionError(
+            f"{source}: {' and '.join(map(shown, candidates))} by the name is not the temperature of the tool, and no "
+            "other column is. Is the run to do without temperature?",
+            [none_of(WARMTH), *candidates_for(WARMTH, candidates, values)[:-1]],
+        )
+    of_tool = [n for n in beside if not is_of_surroundings(n)] or beside
+    return [n for n in of_tool if not _CALLED_REFERENCE.search(spelled(n))] or of_tool
 
 
 def _unit(column: str, name: str, stated: str, values: Array | None, source: str) -> str:

@@ -68,16 +68,18 @@ from mwdcal.files.runs import (
     to_readings,
 )
 from mwdcal.files.statements import stated_table
-from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, WARMTH
+from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, OURS, WARMTH
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside
 from mwdcal.identification.columns import (
     MEASURED_BY_TOOL,
+    OF_SEVERAL_TOOLS,
     answers_of_north,
     in_units,
     is_computed,
     is_filler,
+    is_not_of_tool,
     is_of_surroundings,
     is_of_tool,
     meaning,
@@ -366,14 +368,13 @@ class OpenAxes(NamedTuple):
 class Proposal(NamedTuple):
     """A profile, how the axes of each triad in it were told, and the run that told.
 
-    `unused` are columns of the table that are nothing of a run file, `remarks` sentences on rows that are left out,
-    `by_value` columns of a run file whose
-    unit no name states; `metadata` what the table says of itself; `where` the table was, if it was looked for;
-    `open_axes` the triads of which the run does not tell the axes, `ignored` columns that are called as references
-    but hold no references, each with the reason; `by_readings` what the names leave open and the readings answer;
-    `source` the name of the file; `all_fit`: no station is far from what the others tell;
-    `level`: the least and the largest inclination, degrees, where they are too close for a calibration; `said` what
-    the user says of columns and settings, by name.
+    `unused` are columns of the table that are nothing of a run file, in words, and `others` their names; `remarks`
+    sentences on rows that are left out, `by_value` columns of a run file whose unit no name states; `metadata` what
+    the table says of itself; `where` the table was, if it was looked for; `open_axes` the triads of which the run does
+    not tell the axes, `ignored` columns that are called as references but hold no references, each with the reason;
+    `by_readings` what the names leave open and the readings answer; `source` the name of the file; `all_fit`: no
+    station is far from what the others tell; `level`: the least and the largest inclination, degrees, where they are
+    too close for a calibration; `said` what the user says of columns and settings, by name.
     """
 
     profile: Profile
@@ -392,6 +393,7 @@ class Proposal(NamedTuple):
     all_fit: bool = False
     level: tuple[float, float] | None = None
     said: Collection[str] = ()
+    others: tuple[str, ...] = ()
 
 
 def propose(
@@ -560,6 +562,7 @@ def _proposal(
         _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
         readings.metadata, readings.run_sha256, where, open_axes, ignored, source=table.source,
         all_fit=_all_fit(readings, wirings), level=_level(readings), said=said,
+        others=tuple(n for n in table.columns if n not in {*OURS, *ignored, *(c.name for c in columns.values())}),
     )  # fmt: skip
 
 
@@ -827,9 +830,10 @@ def _alike(angles: Array) -> float:
 def _is_of_readings(answer: Answer, question: QuestionError) -> bool:
     """Whether an answer names columns that the readings tell; of azimuths they tell the north as well.
 
-    Angles that the tool itself may have measured fit its readings whatever the stand shows.
+    Angles that the tool itself may have measured fit its readings whatever the stand shows, and the channels of each
+    of several tools fit.
     """
-    if MEASURED_BY_TOOL in question.text:
+    if any(words in question.text for words in (MEASURED_BY_TOOL, OF_SEVERAL_TOOLS)):
         return False
     pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
     return len(pairs) == len(answer.arguments) and all(
@@ -1659,17 +1663,26 @@ _OTHER_SIGN = str.maketrans("+-", "-+")
 
 
 def lines_not_taken(proposal: Proposal) -> list[Finding]:
-    """A finding on each nominal or unclear reference beside the table, where the run has no other."""
+    """A finding on each reference beside the table that is nominal or unclear, where the run has no other, or another.
+
+    Another one is of a place or a day that the table says not to be those of the run.
+    """
     columns = proposal.profile.columns
     named = {} if isinstance(columns, msgspec.UnsetType) else columns
-    lines = proposal.where.titles.not_taken if proposal.where else {}
-    return references_not_taken(
-        {
-            c: shown(t)[1:-1]
-            for c, t in lines.items()
-            if c not in named and c not in proposal.metadata
-        }
-    )
+    if proposal.where is None:
+        return []
+    block, stated = proposal.where.titles, proposal.metadata
+    others = [
+        Finding(
+            id="reference-not-taken",
+            text=f"{column}: {stated[column]:.8g} is taken, by the words beside it, and not {other:.8g} of the line "
+            f"{shown(line)}. If that one holds, state it in a column.",
+        )
+        for column, (line, other) in block.others.items()
+        if column in stated and not (column in named and named[column].name in proposal.where.names)
+    ]
+    lines = {c: shown(t)[1:-1] for c, t in block.not_taken.items() if c not in {*named, *stated}}
+    return others + references_not_taken(lines)
 
 
 def answers_by_readings(proposal: Proposal) -> list[Finding]:
@@ -1718,11 +1731,12 @@ def warmth_by_unit(proposal: Proposal) -> list[Finding]:
         return []
     where, source = proposal.where, (proposal.profile.columns or {}).get(WARMTH)
     units = dict(zip(where.names, where.units, strict=True)) if where else {}
-    names = [source.name] if source else [each.strip("'") for each in proposal.unused]
+    names = [source.name] if source else proposal.others
     warm = [
         n
         for n in names
         if warm_unit(n, u := units.get(n, ""))
+        and not is_not_of_tool(n)
         and not meaning(n.replace("°", ""), u.replace("°", ""))
     ]
     text = (
@@ -1778,8 +1792,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
 
 def depths_of_surveys(proposal: Proposal) -> str:
     """The column of measured depths in a table without the angles that a calibration needs; empty without one."""
-    names = (each.strip("'") for each in proposal.unused) if proposal.open_axes else ()
-    return next(filter(is_depth, names), "")
+    return next(filter(is_depth, proposal.others if proposal.open_axes else ()), "")
 
 
 def of_surveys(proposal: Proposal) -> list[Finding]:

@@ -389,6 +389,7 @@ def screen(
     counts += without_verdict(facts)
     if facts.blind:
         counts.append(f"{facts.blind} blind to interference")
+    counts += [] if facts.end else ["no positions"]
     heading = [well.readings.name, plural(facts.rows, "survey"), *counts]
     heading += [*signature_status(signature), *simulated(*metadata)]
     lines = [

@@ -53,6 +53,7 @@ from mwdcal.survey.surveying import (
     WellInputs,
     by_row,
     check_free,
+    check_path,
     claim,
     depth_column,
     depths,
@@ -71,7 +72,7 @@ from mwdcal.survey.surveying import (
     with_section,
     with_stated_unit,
 )
-from mwdcal.survey.well import Before, Well, WellCounts, part_of_well, with_findings
+from mwdcal.survey.well import LACKING_PATH, Before, Well, WellCounts, part_of_well, with_findings
 from mwdcal.use.correction import (
     WINDOW_ROWS,
     RowCounts,
@@ -175,6 +176,8 @@ def survey_file(
     )
     long = _LongTable(settings, readings, output, decimal)
     long.north = with_section(long.north, section_azimuth)
+    lacking = "" if long.located else LACKING_PATH[False]
+    check_path(lacking, tie_in=tie_in, section_azimuth=section_azimuth)
     digests = {"calibration": digest, "readings": sha256_of(readings)}
     with atomic.replacing(output) as stream, closing(long.sink(stream)) as sink:
         for columns in long.columns():

@@ -347,6 +347,18 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
     return name, LENGTH_UNITS[unit]
 
 
+def check_path(lacking: str, **options: object) -> None:
+    """Refuse an option on positions where there are none; `lacking`: what a path lacks, blank where there is one.
+
+    Raises:
+        InputError: positions are asked for, and there are none.
+    """
+    names = [name for name, value in options.items() if value]
+    if lacking and names:
+        why = lacking.removeprefix("no well path: ")
+        raise InputError(f"`{names[0]}` needs a well path, which these surveys do not have: {why}")
+
+
 def _may_be_depths(table: Table, name: str) -> bool:
     """Whether most cells of a column have numbers, which never decrease, change, and do not count the stations."""
     cells = table.columns[name]

@@ -163,8 +163,8 @@ def command(
 
     \b
     Example: mwdcal survey tool.json surveys.csv --reference here.json -o well.csv --report well.html
-    Exit: 0 written, 2 input cannot be read, or does not belong to the calibration, 3 a question is open, or with --msa:
-    the surveys do not separate interference from azimuth.
+    Exit: 0 written, 2 input cannot be read, does not belong to the calibration, or lacks the depths of positions asked
+    for by an option, 3 a question is open, or with --msa: the surveys do not separate interference from azimuth.
     """
     from mwdcal.files.formats import atomic
     from mwdcal.presentation.signature import load_calibration
@@ -180,8 +180,7 @@ def command(
     options.check_outputs([output, msa_html, contributions, listing], given, page=report)
     unit = length_unit or ""
     start, ends = _tie_in(tie_in, unit), _switch(switch)
-    loaded = [load_calibration(tool, key) for tool, _ in pairs]
-    said = options.said(decimal)
+    loaded, said = [load_calibration(tool, key) for tool, _ in pairs], options.said(decimal)
     wanted = report, contributions, listing, station, covariance, said.statements, said.answers
     whole = any((msa, axial_correction, missing == "blank", run, registry, *wanted))
     if not whole and long_table.in_parts(readings, output, loaded[0].calibration.profile):
@@ -201,6 +200,7 @@ def command(
     _check_analyses(inputs, analyses, loaded, pages, report, as_json)
     way: Any = {"tie_in": start, "switch": ends, "outside": outside, "axial": axial_correction}
     result = survey_runs(inputs, analyses, **way)
+    _check_positions(result, tie_in, section_azimuth, covariance, listing)
     pages += _pages(result, report, contributions, station) + _listing(result, listing)
     atomic.write_all([_table(result, output, covariance), *pages])
     files, more = (
@@ -270,6 +270,17 @@ def _listing(result: SurveyedWell, file: Path | None) -> Outputs:
     from mwdcal.presentation.listing import listing
 
     return [(file, tables.rendered(file, listing(result)))]
+
+
+def _check_positions(
+    result: SurveyedWell, tie_in: str | None, section: float, covariance: bool, listing: Path | None
+) -> None:
+    """Refuse options on positions of a well that has none."""
+    from mwdcal.survey.surveying import check_path
+
+    lacking = next((each.text for each in result.well.findings if each.id == "no-path"), "")
+    options_on_path = {"section_azimuth": section, "covariance": covariance, "listing": listing}
+    check_path(lacking, tie_in=tie_in, **options_on_path)
 
 
 def _interference_page(

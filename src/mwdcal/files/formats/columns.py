@@ -104,23 +104,32 @@ def check_names(names: Sequence[str], where: str) -> None:
         )
 
 
-def plain_names(names: Sequence[str]) -> list[str]:
+def plain_names(names: Sequence[str], lone_mark: str = "") -> list[str]:
     """The names as text tables and workbooks can have them; those that they can have are kept.
 
     One line without control characters and blanks around, no '#' before the first, none blank, no
-    two alike.
+    two alike. `lone_mark`: the name of a first column that is called '#' and nothing else.
 
     >>> plain_names(["#ax", "Temp\\n(C)", "", "note", "note ", "note"])
     ['ax', 'Temp (C)', 'column 3', 'note', 'note (2)', 'note (3)']
     """
     plain = [_CONTROLS.sub(" ", name).strip() for name in names]
-    plain[:1] = [name.lstrip("# ") for name in plain[:1]]
+    plain[:1] = [name.lstrip("# ") or (name and lone_mark) for name in plain[:1]]
     taken = {name for name, wanted in zip(names, plain, strict=True) if name == wanted}
     for place, (name, wanted) in enumerate(zip(names, plain, strict=True)):
         if not wanted or name != wanted or name in names[:place]:
             plain[place] = _free(wanted or f"column {place + 1}", taken)
             taken.add(plain[place])
     return plain
+
+
+def plain_headings(names: Sequence[str]) -> list[str]:
+    """The names of a table that is read, in which '#' alone may head the first column.
+
+    >>> plain_headings(["#", "ax"]), plain_headings(["# ax", "#"]), plain_headings(["", "#"])
+    (['#', 'ax'], ['ax', '#'], ['column 1', '#'])
+    """
+    return plain_names(names, "#")
 
 
 Merged = Sequence[tuple[tuple[int, int], tuple[int, int]]]

@@ -26,7 +26,7 @@ from mwdcal.files.formats.columns import (
     as_text,
     letters_of,
     looks_numeric,
-    plain_names,
+    plain_headings,
     shown,
 )
 from mwdcal.files.formats.settings import (
@@ -393,7 +393,7 @@ def _of_stations(tool: Layout, stand: Layout) -> Layout | None:
             said = f"{what} are those of {where} at the same {shown(name)}."
             return replace(
                 tool,
-                names=plain_names([*tool.names, *(stand.names[k] for k in more)]),
+                names=plain_headings([*tool.names, *(stand.names[k] for k in more)]),
                 units=[*tool.units, *(stand.units[k] for k in more)],
                 cells=[*tool.cells, *([stand.cells[k][row] for row in rows] for k in more)],
                 texts=[*tool.texts, *([stand.texts[k][row] for row in rows] for k in more)],
@@ -438,7 +438,7 @@ def _side_by_side(one: Layout, other: Layout) -> Layout:
     """A table with the columns of another sheet that it does not have."""
     _, equal = _shared(one, other)
     more = [k for k, name in enumerate(other.names) if name not in equal]
-    names = plain_names([*one.names, *(other.names[k] for k in more)])
+    names = plain_headings([*one.names, *(other.names[k] for k in more)])
     places = [shown(t.sheet if one.sheet != other.sheet else t.heading) for t in (one, other)]
     said = (
         f"{' and '.join(places)} are one table: in all {len(one.lines)} rows they have "
@@ -635,7 +635,8 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
     metadata = {**stated, **block.metadata}
     not_taken = {c: line for b in [*blocks[::-1], block] for c, line in b.not_taken.items()}
     choices = {c: each for b in [*blocks[::-1], block] for c, each in b.choices.items()}
-    whole = Titles(metadata, "" if "date" in metadata else day, not_taken, choices)
+    others = {c: line for b in [*blocks[::-1], block] for c, line in b.others.items()}
+    whole = Titles(metadata, "" if "date" in metadata else day, not_taken, choices, others)
     return replace(layout, titles=whole if blocks else block)
 
 
@@ -1175,7 +1176,7 @@ def _with_rows_of_headings(layout: Layout) -> Layout:
     said = f"the groups of columns of {', '.join(places)} are rows, with {shown(headings.name)} by their headings."
     return replace(
         layout,
-        names=plain_names([*(layout.names[k] for k in others), *headings.places, headings.name]),
+        names=plain_headings([*(layout.names[k] for k in others), *headings.places, headings.name]),
         units=[*(layout.units[k] for k in [*others, *units]), ""],
         cells=below(layout.cells),
         texts=below(layout.texts),
@@ -1210,7 +1211,7 @@ def _with_triad_above(layout: Layout) -> Layout:
         unit or (stated[0] if stated and k in axes else "") for k, unit in enumerate(layout.units)
     ]
     names = [_with_title(title, n) if k in axes else n for k, n in enumerate(layout.names)]
-    return replace(layout, names=plain_names(names), units=units)
+    return replace(layout, names=plain_headings(names), units=units)
 
 
 def _with_triads_beside(layout: Layout) -> Layout:
@@ -1246,7 +1247,7 @@ def _pivoted(
     names = [_with_title(value, layout.names[k]) for k, value in more]
     return replace(
         layout,
-        names=plain_names([*(layout.names[k] for k in shared), *names]),
+        names=plain_headings([*(layout.names[k] for k in shared), *names]),
         units=[layout.units[k] for k in (*shared, *(k for k, _ in more))],
         cells=beside(layout.cells),
         texts=beside(layout.texts),
@@ -1353,7 +1354,7 @@ def _used(
     columns = [[row[k] if k < len(row) else "" for _, row in rows] for k in range(width)]
     used = [k for k in range(width) if names[k] or any(cell != "" for cell in columns[k])]
     return (
-        plain_names([names[k] for k in used]),
+        plain_headings([names[k] for k in used]),
         [units[k] for k in used],
         [columns[k] for k in used],
         [letters_of(first + k) for k in used],
@@ -1373,22 +1374,31 @@ def _apart(
         parts: Iterable[Cells] = cells or [column]
         whole += [(part, unit, [*c], letter) for part, c in zip(each, parts, strict=True)]
     return (
-        plain_names([each[0] for each in whole]),
+        plain_headings([each[0] for each in whole]),
         [each[1] for each in whole],
         [each[2] for each in whole],
         [each[3] for each in whole],
     )
 
 
+_GREEK_ANGLE = re.compile(r"[ΘθϑΦφϕΨψΑαΒβΓγΙι](?![\u0370-\u03ffA-Za-z])")
+"""A letter that is an angle, and what says more of it in words of other alphabets or in brackets."""
+
+
 def _in_degrees(
     names: Sequence[str], units: Sequence[str], columns: Sequence[list[object]], said: str
 ) -> tuple[list[str], list[str], list[list[object]]]:
-    """The same with degrees, minutes and seconds of angles as degrees; lines `said` above may tell how they stand."""
+    """The same with degrees, minutes and seconds of angles as degrees; lines `said` above may tell how they stand.
+
+    Greek letters of angles do not say which; brackets behind them that do so stay.
+    """
     whole = [*zip(names, units, columns, strict=True)]
     for place, (name, unit, column) in enumerate(whole):
-        plain = _BRACKETS.sub("", name).strip()
+        greek = bool(_GREEK_ANGLE.match(name))
+        whole_name = greek and resembled(spelled(name))
+        plain = name if whole_name else _BRACKETS.sub("", name).strip()
         meant = resembled(spelled(plain))
-        if meant and (meant.column.endswith("_deg") or plain.lower() == "az"):
+        if greek or (meant and (meant.column.endswith("_deg") or plain.lower() == "az")):
             cells = figures.sexagesimal(column, f"{name} {unit} {said}")
             if cells != column:
                 whole[place] = (f"{plain} (°)", "", cells)

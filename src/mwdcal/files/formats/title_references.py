@@ -389,8 +389,30 @@ def stated_above(
     references = _only(values)
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
     choices = {c: tuple(each) for c, each in values.items() if len(each) > 1}
-    metadata = {**references, **block.metadata}
-    return block._replace(metadata=metadata, not_taken=rough, choices=choices)
+    metadata, others = {**references, **block.metadata}, _with_other_values(above, references)
+    return block._replace(metadata=metadata, not_taken=rough, choices=choices, others=others)
+
+
+def _with_other_values(rows: Rows, references: Mapping[str, float]) -> dict[str, tuple[str, float]]:
+    """The first line that states another value of each of some references, and it: of another place, or another day.
+
+    >>> rows = [["Field at the observatory 50210 nT"], ["Field here 50123 nT"], ["50.12 uT in the mean"]]
+    >>> _with_other_values(rows, {"ref_field_nt": 50123.0})
+    {'ref_field_nt': ('Field at the observatory 50210 nT', 50210.0)}
+    """
+    lines: dict[str, tuple[str, float]] = {}
+    stating = [
+        row
+        for row in _without_limits(rows)
+        if not (_OF_UNCERTAINTY.match(_plain(_line(row))) or _COMPONENT_ALONE.match(_clauses(row)))
+    ]
+    for row in stating if references else ():
+        for column, each in _values_in([row]).items():
+            taken = references.get(column, 1.0)  # a standard gravity is no place's
+            apart = [v for v in each if abs(v - taken) > _SAME_VALUE * abs(taken)]
+            if taken != 1.0 and 1.0 not in each and apart and len(apart) == len(each):
+                lines.setdefault(column, (_line(row), apart[0]))
+    return lines
 
 
 def _of_the_stand(column: str, values: dict[float, None], rows: Rows) -> dict[float, None]:
@@ -414,6 +436,8 @@ def _of_the_stand(column: str, values: dict[float, None], rows: Rows) -> dict[fl
     return values
 
 
+_SAME_VALUE = 5e-4
+"""By how much a reference is rounded at most, as a share: 66.12° and 66.1° are one dip."""
 _CALLED_DIP = re.compile(r"\bdip\b|magn|fel[dt]|campo|磁")
 """Words of a dip, beside an inclination that may be the stand's."""
 _LONG_WORD = rf"{_CHINESE}{{2,}}|(?:(?!{_CHINESE})[^\W\d_]){{4,}}"

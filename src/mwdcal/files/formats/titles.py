@@ -179,13 +179,14 @@ class Titles(NamedTuple):
     """Metadata by key, and a day that may be read in two ways, as it stands.
 
     `not_taken` are lines with a nominal or approximate reference, by column of a run file; `choices` are references
-    of which lines state different values.
+    of which lines state different values; `others` lines with another value than the one taken, and it.
     """
 
     metadata: Mapping[str, object]
     unclear_day: str = ""
     not_taken: Mapping[str, str] = {}
     choices: Mapping[str, tuple[float, ...]] = {}
+    others: Mapping[str, tuple[str, float]] = {}
 
 
 def titles(rows: Sequence[Sequence[object]]) -> Titles:
