@@ -368,8 +368,8 @@ def _remarks(table: Table, marks: Marks) -> Iterator[str]:
         why = "rejected, without a reading, for a check, or copies of others"
         yield f"rows that are {why}, are left out: {listed(each, MARKS_NAMED)}."
     for what, cells in (
-        ("may be marked as rejected", marks.doubtful),
-        ("have remarks that are not understood", marks.remarked),
+        ("that may be marked as rejected", marks.doubtful),
+        ("with remarks that mwdcal does not understand", marks.remarked),
     ):
         said = {
             row: f"{shown(name)}: {shorten(cell, _LONGEST_REMARK, placeholder='…')}"
@@ -380,7 +380,7 @@ def _remarks(table: Table, marks: Marks) -> Iterator[str]:
         if said:
             each = [f"{place(table, row)} ({text})" for row, text in sorted(said.items())]
             yield (
-                f"rows that {what} are used: {listed(each, MARKS_NAMED)}. To leave them out, or to keep them without "
+                f"rows {what} are used: {listed(each, MARKS_NAMED)}. To leave them out, or to keep them without "
                 "this line, use leave_out or keep in [table] of the tool profile."
             )
 
