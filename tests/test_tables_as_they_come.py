@@ -922,6 +922,7 @@ REJECTED = {
     "Uwagi": {7: "zakłócenie (wózek) – odrzucić", 20: "BŁĘDNA"},
     "Catatan": {7: "ditolak", 20: "getaran, tidak dipakai"},
     "Note": {7: "da scartare", 20: "à exclure"},
+    "Obs": {7: "linha repetida, desconsiderar", 20: "row repeated, ignore"},
     "Opmerking": {7: "niet gebruiken", 20: "respins"},
     "Poznámka": {7: "neplatný", 20: "жарамсыз"},
     "Reject": {7: "x", 20: "x"},

@@ -66,10 +66,11 @@ _MAY_REJECT = re.compile(
 )
 """A cell that may reject its row, or speak of another one."""
 _MEASURED_AGAIN = re.compile(
-    r"repeat(ed)?|re-?(taken|shot|shoot|read|done|measured|run)|again|wiederh\w*|gjentatt|omm[aå]lt|repetid[oa]|repet\w*|"
+    r"(?<!row )(?<!line )repeat(ed)?(?! (row|line))|re-?(taken|shot|shoot|read|done|measured|run)|again|"
+    r"(?<!zeile )wiederh\w*|gjentatt|omm[aå]lt|(?<!linha )(?<!fila )(?<!ligne )repet\w*|"
     r"повтор\w*|重测|重新"
 )
-"""Words of a row that was measured again: it counts where no row beside it is of the same setting."""
+"""Words of a row that was measured again, not written again: it counts where no row beside it is of its setting."""
 _REFUSED = re.compile(rf"(?<![^\W\d_])({OF_REFUSAL}|fail(ed)?|outlier)(?![^\W\d_])")
 """Words that reject a row whatever was done then."""
 _REJECTS_PREVIOUS = re.compile(
