@@ -335,10 +335,14 @@ def test_degrees_minutes_and_seconds_of_one_angle_alone(tmp_path, names, below):
 
 
 @pytest.mark.parametrize("form", ["{}-15-36", "{} 15 36", "{}:15:36"])
-def test_degrees_minutes_and_seconds_in_a_cell_without_their_signs(tmp_path, form):
-    rows = [[row[0] // 1 + 0.26, *row[1:]] for row in stations()]
-    table = lines_of([[form.format(int(row[0])), *row[1:]] for row in rows])
-    assert same(taken(written(tmp_path / "run.csv", table)), rows)
+@pytest.mark.parametrize(("angles", "delimiter"), [(1, ";"), (3, "\t")])
+def test_degrees_minutes_and_seconds_in_a_cell_without_their_signs(
+    tmp_path, form, angles, delimiter
+):
+    rows = [[*(a // 1 + 0.26 for a in row[:angles]), *row[angles:]] for row in stations()]
+    cells = [[*(form.format(int(a)) for a in row[:angles]), *row[angles:]] for row in rows]
+    lines = [line.replace(";", delimiter) for line in lines_of(cells)]
+    assert same(taken(written(tmp_path / "run.csv", lines)), rows)
 
 
 def test_a_line_says_what_each_channel_is(tmp_path):
@@ -423,6 +427,7 @@ def test_limits_and_former_calibrations_are_no_references():
     [
         [["Local gravity", 9.79285, "m/s²", "(= 0.99859 g, 1 g = 9.80665 m/s²)"]],
         [["Gravedad local:", 9.79285, "m/s²", "(1 g = 9,80665 m/s²)"]],
+        [["Local gravity", 9.79285 / 9.80665, "g (9.80665 m/s²)"]],
         [["g ref.", 9.79285, "m/s²"], ["Unidad g = 9,80665 m/s²"]],
         [["Ускорение свободного падения, м/с²:", 9.79285], ["1 g = 9,80665 м/с²"]],
     ],
@@ -433,6 +438,20 @@ def test_what_a_unit_is_states_no_reference(rows):
     assert stated_above(rows).metadata == {"ref_gravity_g": pytest.approx(gravity, rel=1e-12)}
     assert stated_above(rows[1:]).metadata == {}
     assert stated_above([["Local gravity 9.81 m/s² (= 9.83 m/s²)"]]).metadata == {}
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value"),
+    [
+        (["B = 500,10 mGs"], "ref_field_nt", 50010.0),
+        (["Sudut dip", -31.3, "derajat"], "ref_dip_deg", -31.3),
+        (["Dalım açısı", "57,60°"], "ref_dip_deg", 57.6),
+    ],
+)
+def test_references_in_words_and_units_of_other_laboratories(row, column, value):
+    beside = [] if column == "ref_field_nt" else [["Total field", "50010 nT"]]
+    metadata = stated_above([*beside, row]).metadata
+    assert metadata[column] == pytest.approx(value, rel=1e-12)
 
 
 def test_a_station_is_no_unit():

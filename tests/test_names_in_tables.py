@@ -11,6 +11,75 @@ from test_headers import taken
 from test_tables_as_they_come import table, written
 
 CHANNELS = ("ax", "ay", "az", "mx", "my", "mz")
+INCLINATIONS = (
+    *(
+        "Eğim açısı",
+        "Zenit açısı",
+        "Kuyu eğimi",
+        "Düşeyden açı",
+        "Kąt zenitalny",
+        "Sudut kemiringan",
+    ),
+    *(
+        "Sudut dari vertikal",
+        "Angolo di inclinazione",
+        "Angolo zenitale",
+        "Inclinatiehoek",
+        "Hellingshoek",
+    ),
+    *(
+        "Unghi de înclinare",
+        "Úhel sklonu",
+        "Inklinace",
+        "Zenitový úhel",
+        "Көлбеу бұрышы",
+        "Inklin.",
+    ),
+)
+AZIMUTHS = (
+    *(
+        "Azimut açısı",
+        "Semt açısı",
+        "Yön",
+        "Kąt azymutu",
+        "Azimut magnetik",
+        "Sudut azimut",
+        "Arah",
+    ),
+    *(
+        "Angolo di azimut",
+        "Direzione",
+        "Acim. mag.",
+        "Azimuthoek",
+        "Magnetische richting",
+        "Unghi de azimut",
+    ),
+    *("Azimut magnetický", "Směr", "Azimuth Mag. North", "Hole Direction", "Магниттік азимут"),
+)
+TOOLFACES = (
+    *("Toolface açısı", "Takım açısı", "Alet yüzü", "Yuvarlanma açısı", "Dönme açısı", "TF açısı"),
+    *(
+        "Kąt toolface",
+        "Kąt skręcenia",
+        "Kąt TF",
+        "Sudut muka alat",
+        "Sudut putar",
+        "Angolo di rollio",
+    ),
+    *("Rotazione", "Angle de toolface", "Orient. outil", "Face da ferr.", "Ângulo toolface"),
+    *(
+        "Cara herram.",
+        "Cara de herram.",
+        "Cara htta.",
+        "Orient. herram.",
+        "Toolface-hoek",
+        "Rolhoek",
+    ),
+    *("Rotatiehoek", "Fața sculei", "Unghi de ruliu", "Úhel natočení", "Čelo nástroje"),
+    *("Бұрылу бұрышы", "Ауытқытқыш бұрышы", "Grav. TF", "Roll Ang."),
+)
+"""Headings of laboratories in Turkish, Polish, Indonesian, Italian, French, Portuguese, Spanish, Dutch, Romanian,
+Czech, Kazakh and the English of the Gulf."""
 
 
 def numbers(path, column):
@@ -57,6 +126,17 @@ def numbers(path, column):
         ("Gx målt (mg)", "ax", "mg"),
         ("Ts(C)", "temperature_c", "°C"),
         ("Giro (toolface) graus", "ref_toolface_deg", "°"),
+        *((f"{n} (°)", "ref_inclination_deg", "°") for n in INCLINATIONS),
+        *((f"{n} (°)", "ref_azimuth_deg", "°") for n in AZIMUTHS),
+        *((f"{n} (°)", "ref_toolface_deg", "°") for n in TOOLFACES),
+        ("İvme ölçer X (V)", "ax", "V"),
+        ("Versnellingsmeter X (V)", "ax", "V"),
+        ("Aksel. X (V)", "ax", "V"),
+        ("Үдеу X (V)", "ax", "V"),
+        ("Indukcja X (V)", "mx", "V"),
+        ("Magnetisch veld X (V)", "mx", "V"),
+        ("Câmp magnetic X (V)", "mx", "V"),
+        ("Магнит өрісі X (V)", "mx", "V"),
         ("Azimute (mag) graus", "ref_azimuth_deg", "°"),
         ("Inclinação (dev) graus", "ref_inclination_deg", "°"),
         ("maz_deg", "ref_azimuth_deg", "°"),

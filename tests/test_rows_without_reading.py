@@ -64,7 +64,8 @@ def test_the_number_of_a_series_is_no_serial(line, serial):
 
 
 @pytest.mark.parametrize(
-    "name", ["Elevação", "Elevación", "Élévation", "Elevazione", "Høydevinkel"]
+    "name",
+    ["Elevação", "Elevación", "Élévation", "Elevazione", "Høydevinkel", "Elewacja", "Elevasi"],
 )
 def test_an_elevation_is_one_in_the_languages_of_the_laboratories(tmp_path, name):
     rows = [[90 - inclination, *rest] for inclination, *rest in stations()]

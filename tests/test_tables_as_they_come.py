@@ -922,6 +922,13 @@ REJECTED = {
     "Obs.": {7: "rejeitado", 20: "descartada"},
     "Примечание": {7: "брак", 20: "не годен"},
     "备注": {7: "作废", 20: "剔除"},
+    "Not": {7: "GEÇERSİZ – araç geçti", 20: "kullanılmayacak"},
+    "Uwagi": {7: "zakłócenie (wózek) – odrzucić", 20: "BŁĘDNA"},
+    "Catatan": {7: "ditolak", 20: "getaran, tidak dipakai"},
+    "Note": {7: "da scartare", 20: "à exclure"},
+    "Obs": {7: "linha repetida, desconsiderar", 20: "row repeated, ignore"},
+    "Opmerking": {7: "niet gebruiken", 20: "respins"},
+    "Poznámka": {7: "neplatný", 20: "жарамсыз"},
     "Reject": {7: "x", 20: "x"},
 }
 
@@ -986,6 +993,42 @@ def test_a_doubtful_mark_is_asked_about(tmp_path, name, cells, usual, text):
 )
 def test_other_remarks_mark_nothing(tmp_path, text):
     assert read(written(tmp_path / "a.csv", table(**marked("Remarks", {7: text})))).count == 48
+
+
+REMARKS = {
+    7: "batu jatuh, lihat buku",
+    20: "a truck went by and the whole hut shook for a long while, see page 12",
+}
+
+
+def test_remarks_that_are_not_understood_are_named_in_one_line(tmp_path):
+    """In words that no list has: the rows count, and the reader decides."""
+    said = "rows with remarks that mwdcal does not understand are used"
+    path = written(tmp_path / "a.csv", table(**marked("Catatan", {3: "-", **REMARKS})))
+    ran, _ = calibrated(tmp_path, path)
+    assert "48 stations" in ran.out
+    (line,) = (each for each in ran.err.split("! ") if said in " ".join(each.split()))
+    plain = " ".join(line.split())
+    assert f"line 8 ('Catatan': {REMARKS[7]}), line 21 ('Catatan': a truck went by" in plain
+    assert "page 12" not in plain
+    assert "leave_out or keep" in plain
+    ran, _ = calibrated(tmp_path, path, "--leave-out", f"Catatan={REMARKS[7]}")
+    assert "47 stations" in ran.out
+    keep = [part for text in REMARKS.values() for part in ("--keep", f"Catatan={text}")]
+    ran, _ = calibrated(tmp_path, path, *keep)
+    assert said not in " ".join(ran.err.split())
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [
+        ["P1", "P2", "P3", "P4"] * 12, ["J. Ruiz"] * 48, ["08:15", *[""] * 47],
+        ["OK", "ok", "gut", "bra", "bien", "bom"] * 8,
+    ],
+)  # fmt: skip
+def test_labels_operators_times_and_judgements_are_no_remarks(tmp_path, cells):
+    ran, _ = calibrated(tmp_path, written(tmp_path / "a.csv", table(Catatan=cells)))
+    assert "does not understand" not in " ".join(ran.err.split())
 
 
 def test_a_rejected_row_can_be_kept(tmp_path):

@@ -272,6 +272,35 @@ def test_a_unit_of_angles_in_a_title_is_not_that_of_columns_which_it_cannot_be(t
         assert reference(each) == pytest.approx(np.asarray(servo_run()["ref_toolface_deg"]))
 
 
+@pytest.mark.parametrize(
+    ("line", "units"),
+    [("Angles en grades (400 gr = 1 tour)", ("gr", "gr", "gr")), ("", ("gon", "", ""))],
+)
+def test_gons_of_a_line_or_of_one_angle_are_those_of_all(tmp_path, line, units):
+    columns = table(ref_dip_deg=None)
+    for column, unit in zip(ANGLE_COLUMNS.values(), units, strict=True):
+        angles = np.asarray(columns.pop(f"{column} (deg)")) / 0.9
+        columns[f"{column}({unit})" if unit else column] = angles
+    path = written(tmp_path / "a.csv", columns, line)
+    findings = library.propose_profile(path).findings
+    assert "told-by-readings" not in [each.id for each in findings]
+    for name in ANGLE_COLUMNS:
+        assert reference(path, name) == pytest.approx(np.asarray(servo_run()[f"ref_{name}_deg"]))
+
+
+@pytest.mark.parametrize(
+    ("word", "turned"), [("Inklinacja", False), ("Inklinasi", False), ("Dip", True)]
+)
+def test_a_dip_that_turns_counts_from_the_horizontal_in_english_alone(tmp_path, word, turned):
+    """Beside no other inclination; elsewhere the word of both is inclination, which counts from the vertical."""
+    columns = table(ref_dip_deg=None)
+    angles = np.asarray(columns.pop("Inc (deg)"))
+    columns[f"{word} (°)"] = angles - 90 if turned else angles
+    path = written(tmp_path / "a.csv", columns)
+    wanted = np.asarray(servo_run()["ref_inclination_deg"])
+    assert reference(path, "inclination") == pytest.approx(wanted)
+
+
 def test_gons_of_a_title_that_the_readings_do_not_fit_are_asked_about(tmp_path):
     columns = {n.replace(" (deg)", ""): v for n, v in table(ref_dip_deg=None).items()}
     path = written(tmp_path / "a.csv", columns, "theodolite with gon circle")

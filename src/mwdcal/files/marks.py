@@ -11,6 +11,7 @@ import unicodedata
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from textwrap import shorten
 from typing import NamedTuple
 
 import msgspec
@@ -65,10 +66,11 @@ _MAY_REJECT = re.compile(
 )
 """A cell that may reject its row, or speak of another one."""
 _MEASURED_AGAIN = re.compile(
-    r"repeat(ed)?|re-?(taken|shot|shoot|read|done|measured|run)|again|wiederh\w*|gjentatt|omm[aå]lt|repetid[oa]|repet\w*|"
+    r"(?<!row )(?<!line )repeat(ed)?(?! (row|line))|re-?(taken|shot|shoot|read|done|measured|run)|again|"
+    r"(?<!zeile )wiederh\w*|gjentatt|omm[aå]lt|(?<!linha )(?<!fila )(?<!ligne )repet\w*|"
     r"повтор\w*|重测|重新"
 )
-"""Words of a row that was measured again: it counts where no row beside it is of the same setting."""
+"""Words of a row that was measured again, not written again: it counts where no row beside it is of its setting."""
 _REFUSED = re.compile(rf"(?<![^\W\d_])({OF_REFUSAL}|fail(ed)?|outlier)(?![^\W\d_])")
 """Words that reject a row whatever was done then."""
 _REJECTS_PREVIOUS = re.compile(
@@ -100,7 +102,9 @@ _ENTRIES = re.compile(r"[,;|]\s*(?=\w{1,6}\s*=)")
 """The separator before the next entry of a legend."""
 MARKS_NAMED = 8
 """Rows that a sentence names."""
-_MARK_NUMBERS = frozenset("0123456789+-−eE.,:;/ ")
+_LONGEST_REMARK = 60
+"""Letters of a remark that a sentence quotes."""
+_MARK_NUMBERS = frozenset("0123456789+-−–—eE.,:;/ ")
 _MOST_STATIONS = 2000
 """Stations of a run beyond which no copies are looked for."""
 _MOST_VALUES = 5
@@ -114,16 +118,21 @@ UNMARKED = ("group", "serial", *OURS)
 
 
 class Marks(NamedTuple):
-    """Rows that are left out, by number, with what says so; and cells that may reject their rows, which are used."""
+    """Rows that are left out, by number, with what says so; and rows that are used, by column and cell.
+
+    Their cells may reject them, or are remarks in words that are not understood.
+    """
 
     left_out: dict[int, str]
     doubtful: dict[tuple[str, str], list[int]]
+    remarked: dict[tuple[str, str], list[int]]
 
 
 def marks_in(table: Table, form: TableFormat, used: Collection[str]) -> Marks:
     """The marks in the columns of a table that are not `used`, and what the form says of any column."""
     left_out: dict[int, str] = {}
     doubtful: dict[tuple[str, str], list[int]] = {}
+    remarked: dict[tuple[str, str], list[int]] = {}
     for name in table.columns:
         chosen, kept = ({*map(_plain, each.get(name, ()))} for each in (form.leave_out, form.keep))
         judged = name not in used and name not in form.ignore and not name.startswith("witsml ")
@@ -139,17 +148,26 @@ def marks_in(table: Table, form: TableFormat, used: Collection[str]) -> Marks:
         spelt = {cell: _plain(cell) for cell in {*cells}}
         plain = ["" if r in checks else spelt[cell] for r, cell in enumerate(cells)]
         verdicts = _verdicts(_plain(name), plain) if judged else {}
+        verdicts = {c: v for c, v in verdicts.items() if c not in kept} | dict.fromkeys(
+            chosen, True
+        )
         for row, cell in enumerate(plain):
             if judged and row and cell not in kept and _REJECTS_PREVIOUS.search(cell):
                 left_out.setdefault(row - 1, f"the next row, {shown(name)}: {cells[row]}")
-                continue
-            verdict = True if cell in chosen else None if cell in kept else verdicts.get(cell)
-            if verdict:
+            elif verdicts.get(cell):
                 left_out.setdefault(row, f"{shown(name)}: {cells[row] or 'blank'}")
-            elif verdict is not None:
-                doubtful.setdefault((name, cells[row]), []).append(row)
-    open_rows = {key: [r for r in rows if r not in left_out] for key, rows in doubtful.items()}
-    return Marks(left_out, {key: rows for key, rows in open_rows.items() if rows})
+            elif cell in verdicts:
+                others = remarked if verdicts[cell] is None else doubtful
+                others.setdefault((name, cells[row]), []).append(row)
+    used_rows = (
+        {
+            key: left
+            for key, rows in each.items()
+            if (left := [r for r in rows if r not in left_out])
+        }
+        for each in (doubtful, remarked)
+    )
+    return Marks(left_out, *used_rows)
 
 
 def is_the_repeat(table: Table, row: int, cell: str) -> bool:
@@ -179,8 +197,8 @@ def is_disturbance(text: str) -> bool:
     return bool(_DISTURBED.search(plain)) and not others
 
 
-def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
-    """The cells of a column that reject their rows (true), or may do so (false)."""
+def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool | None]:
+    """The cells of a column that reject their rows (true), or may do so (false), and remarks on a few rows (None)."""
     different = {*cells}
     filled = different - {""}
     if len(filled) > _MOST_VALUES:
@@ -192,7 +210,9 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
         return dict.fromkeys(filled & _DENIED, True)
     if judges and _OF_REJECTION.fullmatch(name) and filled <= _AFFIRMED | _DENIED:
         return dict.fromkeys(filled & _AFFIRMED, True)
-    verdicts = {c: True for c in filled if _rejects(c) or _SUPERSEDED.fullmatch(c)}
+    verdicts: dict[str, bool | None] = {
+        c: True for c in filled if _rejects(c) or _SUPERSEDED.fullmatch(c)
+    }
     verdicts |= {c: False for c in filled if c not in verdicts and _MAY_REJECT.search(c)}
     accepted = {c for c in filled if _ACCEPTED.fullmatch(_REMARK_BEHIND.sub("", c))}
     if 2 * sum(map(accepted.__contains__, cells)) < len(cells):
@@ -201,7 +221,9 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool]:
     if judges and (accepted or named):
         usual = accepted or {max(sorted(different), key=cells.count)}
         verdicts |= dict.fromkeys(filled - usual - {*verdicts}, False)
-    return verdicts
+    remarks = {c for c in filled - accepted - {*verdicts} if not set(c) <= _MARK_NUMBERS}
+    few = 2 * sum(c in filled and c not in accepted for c in cells) < len(cells)
+    return verdicts | (dict.fromkeys(remarks) if few else {})
 
 
 def _rejects(text: str) -> bool:
@@ -308,7 +330,7 @@ def without_rejected(
     _check_one_run(table, form)
     marks = marks_in(table, form, used)
     copies = _copies(table)
-    if not marks.left_out and not marks.doubtful and not copies:
+    if not any(marks) and not copies:
         return table
     marks = marks._replace(left_out={**copies, **marks.left_out})
     rows = [row for row in range(table.count) if row not in marks.left_out]
@@ -346,18 +368,22 @@ def _remarks(table: Table, marks: Marks) -> Iterator[str]:
         each = [f"{place(table, row)} ({said})" for row, said in sorted(marks.left_out.items())]
         why = "rejected, without a reading, for a check, or copies of others"
         yield f"rows that are {why}, are left out: {listed(each, MARKS_NAMED)}."
-    doubtful = {
-        row: f"{shown(name)}: {cell}"
-        for (name, cell), rows in marks.doubtful.items()
-        for row in rows
-        if row not in marks.left_out
-    }
-    if doubtful:
-        each = [f"{place(table, row)} ({said})" for row, said in sorted(doubtful.items())]
-        yield (
-            f"rows that may be marked as rejected are used: {listed(each, MARKS_NAMED)}. To leave them out, or to "
-            "keep them without this line, use leave_out or keep in [table] of the tool profile."
-        )
+    for what, cells in (
+        ("that may be marked as rejected", marks.doubtful),
+        ("with remarks that mwdcal does not understand", marks.remarked),
+    ):
+        said = {
+            row: f"{shown(name)}: {shorten(cell, _LONGEST_REMARK, placeholder='…')}"
+            for (name, cell), rows in cells.items()
+            for row in rows
+            if row not in marks.left_out
+        }
+        if said:
+            each = [f"{place(table, row)} ({text})" for row, text in sorted(said.items())]
+            yield (
+                f"rows {what} are used: {listed(each, MARKS_NAMED)}. To leave them out, or to keep them without "
+                "this line, use leave_out or keep in [table] of the tool profile."
+            )
 
 
 def place(table: Table, row: int) -> str:

@@ -16,7 +16,7 @@ _LOOKALIKE = re.compile(r"(?<![^\W\d_])([GABHMАВНМ]?[ХхУу]|[АВНМ][xy
 LATIN_AXES = str.maketrans("АВНМХхУу", "ABHMXxYy")
 """Cyrillic letters of axes and channels, and those that they look like."""
 _ELEVATION = (
-    r"\b(elev(ation)?|hole dip|elevacion|elevacao|elevazione|hoydevinkel|"
+    r"\b(elev(ation)?|hole dip|elevacion|elevacao|elevazione|elewacj[ai]|elevasi|elevace|elevatie|yukselim|hoydevinkel|"
     r"inc\w* (from|to|above|over) (the )?horiz\w*|pitch)\b"
 )
 """Names of angles that count from the horizontal."""
@@ -26,8 +26,8 @@ _CROSSWISE = (
 )
 """Words of an axis across the tool, before its number."""
 _FROM_VERTICAL = (
-    r"(from|to|zur|vo[nm]( der)?|fra|av|de la|a la|da|par rapport a la|от) (the )?"
-    r"(vertical\w*|vertikal\w*|lotrechten|lotlini?e|lot|loddlinjen?|lodd(et)?|вертикали|pionu)\b"
+    r"(from|to|zur|vo[nm]( der)?|fra|av|de la|a la|da|dalla|dari|od|par rapport a la|от) (the )?"
+    r"(vertical\w*|vertikal\w*|lotrechten|lotlini?e|lot|loddlinjen?|lodd(et)?|вертикали|pionu|svislice)\b"
 )
 """Words of an angle that counts from the vertical, as an inclination does."""
 TRANSLATIONS = (
@@ -52,7 +52,11 @@ TRANSLATIONS = (
         r"valor(es)? (bruto|crudo)s?|сыр\w*|исходн\w*)\b[\W_]*(?=[^\W\d_]{3})|原始(数据|值)?(?=.)",
         "",
     ),
-    (r"(?<![^\W\d_])(bohrloch|borehull?s?|boreh(ole)?\b|wellbore)[ ._-]*(?=[^\W\d_])", ""),
+    (
+        r"(?<![^\W\d_])(bohrloch|borehull?s?|boreh(ole)?\b|wellbore|kuyu|hole(?= (azi|dire)))[ ._-]*(?=[^\W\d_])",
+        "",
+    ),
+    (r"\bmag(netic)?\b\.? (north|nord|norte)\b", "mag"),
     (r"(?<=[°º] )[СсC]\b|(?<=[°º])[СсC]\b", "C"),
     (r"(?<![^\W\d_])([CF])°", r"°\1"),
     (r"\bm(illi)?gauss\b", "mG"),
@@ -84,61 +88,71 @@ TRANSLATIONS = (
     ),
     (
         r"inklination( des)? (erd)?(magnet)?felde?s?|"
-        r"복각|magneettinen kaltevuus|magn\w* kaltevuus|magneticka inklinace|manyetik egim|inklinacja( pola|"
-        r" magn\w*)?|magn\w* inklinacio|inclinazione magn\w*|magn\w* inclinatie|"
+        r"복각|magneettinen kaltevuus|magn\w* kaltevuus|magneticka inklinace|inklinace (mag\w*|pole)|"
+        r"manyetik (egi[mk]\w*|dalim)|\bdalim\b|магнит\w* (өріс\w* )?көлбеу\w*|"
+        r"inklinacj[ai]( pola| magn\w*)?|magn\w* inklinacio|inclinazione magn\w*|magn\w* inclinatie|"
         r"\bfall(vinkel)?\b|magn\w* (inklination|lutning)|inklinasi( magnet\w*)?|伏角|"
         r"(угол )?(магнитн\w* )?наклонени[ея]|\bдип\b|(地磁|磁)倾角?|incl\w*\.? magn\w*\.?|"
         r"(magn\w*|felt|feld|field) ?[-_ ]?inkl\w*|mergulho( magn\w*)?|echado|buzamiento|(field|magnetic) inclination",
         "dip ",
     ),
     (
-        rf"(angul[oe]|angle|ang\.|winkel|vinkel|угол|dip|abweichung|avvik|desvio|ecart|отклонение) {_FROM_VERTICAL}|"
-        r"(angulo |angle )?(zenithal|cenital|zenital)|hole angle|zenitwinkel|bohrlochneigung|kippung|schwenkwinkel|"
-        r"hel+ningsvinkel|hellning|天?顶角|kallistus(kulma)?|kallistuma(kulma)?|경사각?|inclinare|naklon\b|nagib\b|sklon\b|klison\b|\bdevi\b|"
+        rf"(angul[oe]|angolo|angle|ang\.|winkel|vinkel|угол|sudut|kat|uhel|dip|abweichung|avvik|"
+        rf"desvio|ecart|отклонение) {_FROM_VERTICAL}|"
+        r"(angulo |angle )?(zenith?al(ny|e|en)?|cenital)|zenitov[aey]|hole angle|egiklik|"
+        r"duseyden( aci\w*| sapma)?|inklinas(yon|jon)|inklinace|көлбеу(лік)?|"
+        r"zenitwinkel|bohrlochneigung|kippung|schwenkwinkel|"
+        r"hel+ningsvinkel|hellning|天?顶角|kallistus(kulma)?|kallistuma(kulma)?|경사각?|"
+        r"inclinare|naklon\b|nagib\b|sklonu?\b|klison\b|\bdevi\b|"
         r"kipp(achse|winkel)|schwenkachse|\btilt\b|inclinazione|inclinatie|helling|\bodch\b\.?(?!\W*st)|haeldning|hældning|lutning|"
-        r"(kat )?odchyleni[ae](?!\W*st)( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|egim|kemiringan|傾斜角?|"
+        r"(kat )?odchyleni[ae](?!\W*st)( od pionu)?|(kat )?nachyleni[ae]|ferdeseg|dolesszog|"
+        r"egim(?!\w{2})i?|kemiringan( lubang)?|傾斜角?|"
         r"鉛直(線)?からの角度?|"
         r"зен\w*\.?( угол\w*)?|"
         r"neigung(swinkel)?|\bneig\b\.?|\bzenit\b|desviacion|sapma( acisi)?|inklination|inclinaison|inclinaca?o|"
         r"inclinacion|zenith( angle)?|drift angle|deviation angle|(?<![a-z])inkl?\b\.?|"
-        r"inklinasjon|helning|инклинация|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角|顶角|天顶角",
+        r"inklin\b\.?|helning|инклинация|зенит\w*( угол)?|наклон(?!ен)|井斜角?|倾角|顶角|天顶角",
         "inclination ",
     ),
     (_FROM_VERTICAL, ""),
     (r"(?<=inclination) *\((dev(iation)?|desv(io)?)\.?\)", ""),
     (
         r"azimutwinkel|\bmaz(?![^\W\d_])|\bmag[ ._-]*az(?![^\W\d_])|"
-        r"\bkurs\b|\bdire(ccion|cao|ction)\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
+        r"\bkurs\b|\bdire(ccion|cao|ction|zione|ctie)\b|\bsemt\b|\bistikamet\b|\byon\b|\barah\b|\bsmer\b|\brumo\b|\bcap\b|\bаз(им)?\b\.?|направление|"
         r"курс|方向角?|磁北からの角度?|"
         r"atsimuutti|suuntakulma|방위각?|\bhazi\b|drehtisch|turn ?table|rotary table|baring|azymut|yonelim|азимут|"
-        r"asimut|\basim?\b\.?|azym\b\.?|azimute?(?!h)|acimut|方位角?|"
-        r"rumbo|richtung(?!swinkel)|retning|peilung",
+        r"asimut|\basim?\b\.?|azym\b\.?|acim\b\.?|azimutov[aey]|azimute?(?!h(?!oek))|acimut|方位角?|"
+        r"rumbo|richting|richtung(?!swinkel)|retning|peilung",
         "azimuth ",
     ),
     (
         r"\bg?tf[oa]\b|tool ?face orientation|relative bearing|\brot\.? angle|toolface[- ]winkel|hochseite(nwinkel)?|"
-        r"hoyside(vinkel)?|cara (herr(amienta|\b\.?)|hta\b\.?)|rolido|"
-        r"(orient\w*\.? (de )?(la )?)?cara alta|"
-        r"alabeo|lado alto|face ferramenta|rolagem|rolamento|rotacao|"
-        r"roulis|rotation propre|orientation (de l')?outil|апсид\w*( угол)?|виз\b\.?( угол)?|(угол )?крена?\b|"
+        r"hoyside(vinkel)?|rolido|(orient\w*\.? (de )?(la )?)?cara alta|orient\b\.? herr(am(ienta)?)?\b\.?|"
+        r"(takim|alet) yuzu|takim(?= aci)|yuvarlanma|donme|donus|muka alat|putar(an)?\b|guling\b|fata sculei|ruliu|"
+        r"cel[oa] nastroje|pootoceni|rota(zione|ce|tie)\b|rotatie(?=hoek)|\brol(?=hoek)|grav\w*\.? tf\b|"
+        r"ауытқытқыш\w*|бұрылу|а[ий]налу|"
+        r"alabeo|lado alto|face (da )?ferr(am(enta)?)?\b\.?|rolagem|rolamento|rotacao|"
+        r"roulis|rotation propre|orient(ation|\b\.?) (de l')?outil|апсид\w*( угол)?|виз\b\.?( угол)?|(угол )?крена?\b|"
         r"(重力)?高边(工具面)?角?|[滚自旋]转角?|横滚角?|面向角|"
         r"\brol(le?|lio|lo)?\b|kierto(kulma)?\b|natoceni|rotire|vridning|툴페이스|공구면각?|롤각?|\brb\b|\bt/f\b|\btfh\b|rollachse|"
-        r"roll axis|(kat )?obrotu?\b|(kat )?skret\w*|\bуво\b|(угол )?верхней образующей|^面角|"
-        r"\brull(e|ing)?\b|rullning|rotasi|(kat )?ustawienia narzedzia|takim yuzu|szerszamallas|"
+        r"roll axis|(kat )?obrotu?\b|(kat )?skre[tc]\w*|\bуво\b|(угол )?верхней образующей|^面角|"
+        r"\brull(e|ing)?\b|rullning|rotasi|(kat )?ustawienia narzedzia|szerszamallas|"
         r"gereedschapsvlak|v(ae|æ)rkt(o|ø)jsflade|faccia utensile|ツールフェ(ー|イ)ス|тулфейс|回転角|угол поворота|"
         r"roll[vw]inkel|roll angle|"
         r"(werkzeug|roll)(winkel|lage|flache)|verdrehung|verdrehwinkel|drehwinkel|rotasjon|rulle?vinkel|"
         r"verktoy(flate|vinkel|side)\w*|(face|angulo) d[ae] ferramenta|(face|angle)( d[e'])? ?(l'?)?outil|"
         r"ghsf?\b|угол установки( отклонител\w*)?|визир\w*( угол)?|"
         r"angulo de giro|giro|вращени[ея]|rotacion|отклонител\w*|откл\b\.?|визирн\w* угол|поворот|工具面角?|"
-        r"\bcara\b(?! *mag)( (de (la )?)?herr(amienta|\b\.?))?|tf grav\w*|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|"
+        r"\bcara\b(?! *mag)( (de (la )?)?(herr(am(ienta)?)?|h(er)?tt?a)\b\.?)?|"
+        r"tf grav\w*|gravity tool ?face|h\.?s\.?[ _-]*tool ?face|"
         r"tool[ _-]*face( (d[ae] )?(la )?grav\w*| ?\(grav\w*\.?\))?",
         "toolface ",
     ),
     (
         r"重力(加速度计?|分量|传感器)(?=[ (（_]*[xyz])|重力[计仪]|аксел\w*\.?|\bуск\b\.?|\bграв\b\.?(?=[ _]*[xyz]\b)|"
         r"kiiht\b\.?|kiihtyvyys|zrychl(eni)?\b\.?|가속도계?|acceleratie|acceleratia|akcelerometry?\b|accelero\b\.?|"
-        r"przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme\w*|versn(elling)?\b\.?|accelerazione|"
+        r"przysp(ieszenie)?\b\.?|gyorsulas(mero)?|ivme( olcer|\w*)|versn(elling(smeter)?)?\b\.?|"
+        r"accelerazione|үдеу\w*|\baksel\b\.?|"
         r"accelerometro|percepatan|加速度|γ|"
         r"beschleunigung\w*|beschl\b\.?|akselerasjon|akselerometer|akselero|aceleracion|acelerometros?|acel\b|"
         r"aceleracao|accelerometres?|acceleration|\bac\.|ускорен\w*|акселерометр\w*|акс\b|\baks\b|加速度计?|加计|加表",
@@ -148,8 +162,9 @@ TRANSLATIONS = (
         r"(\bb-?)?\bfel[dt](?=[ _]*[xyz]\b)|magnetsensor|(campo|champ) mag\w*\.?(?=[ _]*[xyz]\b)|"
         r"(\bмаг\w*\.? ?)?\bполе(?=[ _]*[xyz]\b)|\bмаг\b\.?(?=[ _]*[xyz]\b)|"
         r"磁(场强度|传感器|分量|通|力)(?=[ (（_]*[bhm]?[xyz])|"
-        r"자기장?(?=[ _]*[xyz])|kentta(?=[ _]*[xyz])|pole(?=[ _]*[xyz])|camp(?=[ _]*[xyz])|"
+        r"자기장?(?=[ _]*[xyz])|kentta(?=[ _]*[xyz])|pole(?=[ _]*[xyz])|camp( magn\w*)?(?=[ _]*[xyz])|"
         r"pole magn\w*\.?(?=[ _]*[xyz])|magneses(?=[ _]*[xyz])|manyetik(?=[ _]*[xyz])|magneetveld(?=[ _]*[xyz])|"
+        r"\bveld(?=[ _]*[xyz])|indukcja( magn\w*)?(?=[ _]*[xyz])|(магнит\w* )?өріс\w*(?=[ _]*[xyz])|"
         r"medan(?=[ _]*[xyz])|磁気(?=[ _]*[xyz])|magnetfalt(?=[ _]*[xyz])|campo(?=[ _]*[bhm]?[xyz]\b)|"
         r"\bmagneto\b\.?|magnetometre|magn\b\.?(?=[ _]*[xyz]\b)|magnet(feld|felt)(?=[ _]*[bhm]?[xyz]\b)|"
         r"(magnetic|магнитн\w*) (field|поле)(?=[ _]*[bhm]?[xyz]\b)|champ( magn\w*)?(?=[ _]*[bhm]?[xyz]\b)|"
@@ -220,11 +235,17 @@ TRANSLATIONS = (
     (r"(de|da) [qc]uadr[ií]cula( utm)?|gitter|kartesisch", "grid "),
     (r"achse|aksen?|eje|ось|轴", ""),
     (
-        r"magnetisch\w*|magnetic[oa]s?|magnetique|magnetiska?|magnetycz\w*|manyetik|magneses|магнитн\w*|magnet\b|"
+        r"magnetisch\w*|magnetic[oa]s?|magnetique|magnetiska?|magnetycz\w*|manyetik|magneses|магнитн\w*|магниттік|"
+        r"magneti(k|ck[aey])\b|magnet\b|"
         r"magn\b\.?",
         "magnetic",
     ),
     (r"\((alta|high ?side|lado alto|hochseite|oben)\)", ""),
+    (
+        r"\b(ang(ulo|olo|le)?|kat|sudut|unghi(ul)?|uhel)\b\.?( d[aei]\b)? *(?=(inclination|azimuth|toolface|dip|tf)\b)|"
+        r"(?<=(?:(?<=on)|(?<=th)|(?<=ce)|(?<=ip)|(?<=tf)) )[ -]*(s?hoek|aci\w*|uhel|ang\.|бұрыш\w*)(?![^\W\d_])",
+        "",
+    ),
 )
 """Words of other languages and of WITSML, and the word of the field for each."""
 

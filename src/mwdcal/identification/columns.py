@@ -550,7 +550,10 @@ _DOWNWARDS = re.compile(
 """Words of angles from the horizontal that count downwards."""
 _SPOKEN = {
     "rad": re.compile(r"radian|радиан|(?<!\d)(?<!\d )\brad\b", re.IGNORECASE),
-    "gon": re.compile(r"(?<!\d)(?<!\d )\bgon\b", re.IGNORECASE),
+    "gon": re.compile(
+        r"(?<!\d)(?<!\d )\bgon\b|\b400 ?g(on|r|rad\w*)?\b|\ben grades\b|\bneugrad|\bnygrader|\bgra[ud]\w+ cent[eé]s\w*",
+        re.IGNORECASE,
+    ),
 }
 """Units of angles in a line above a table, not those of a number."""
 _SPOKEN_WARMTH = {
@@ -893,11 +896,14 @@ _TOOL_AXIS = re.compile(
 """Words of the axis of the tool."""
 _OF_VERTICAL = re.compile(r"vert[iy][kc]al|lot\b|lodd|вертикал|铅垂|垂直", re.IGNORECASE)
 _LONE_ANGLES = {
-    "inclination": re.compile(r"(ref )?(desvio|desv\.?|dev\.?|drift)(,? deg)?", re.IGNORECASE),
+    "inclination": re.compile(
+        r"(ref )?(desvio|desv\.?|dev\.?( angle)?|drift|devia(tion|zione|cao|tie|si)|afwijking|odklon)(,? deg)?",
+        re.IGNORECASE,
+    ),
     "azimuth": re.compile(
         r"(ref )?(kompass|brujula|bussola|boussole|компас|phi m(ag)?)(,? deg)?", re.IGNORECASE
     ),
-    "toolface": re.compile(r"(ref )?(face|cara|lado)(,? deg)?", re.IGNORECASE),
+    "toolface": re.compile(r"(ref )?(face|cara|lado|(kat )?przechyl\w*)(,? deg)?", re.IGNORECASE),
 }
 """Names that say an angle where no other column is this angle, as `spelled` gives them without their unit."""
 _OF_UNITS = {"g": "a", "mg": "a", "m/s²": "a", "nT": "m", "µT": "m", "gauss": "m", "mG": "m"}
@@ -1289,7 +1295,7 @@ def _chosen(
         if not answered and candidates:
             answered = questions.ask(_one, column, candidates, values, source)
         if name := answered:
-            stated = meanings[name].unit or _angles(column, spoken)
+            stated = _angles(column, meanings[name].unit, spoken)
             stated = stated or (warmth if column == WARMTH else "")
             cells = values(name)
             unit = questions.ask(_unit, column, name, stated, cells, source)
@@ -1371,14 +1377,16 @@ def _tell_by_values(
 def _tell_dip(meanings: dict[str, Resemblance], values: Values) -> None:
     """Of several inclinations the one that hardly varies is the dip, where no column is called so.
 
-    And a dip that turns, beside no inclination, is that of the hole: from the horizontal.
+    And a dip that turns, beside no inclination, is that of the hole: from the horizontal, unless its word is a
+    language's own for an inclination: Inklinacja, Inklinasi.
     """
     inclined = [n for n, m in meanings.items() if m.column == REFERENCES["inclination"].column]
     for name in [n for n, m in meanings.items() if m.column == REFERENCES["dip"].column]:
         cells = values(name)
         known = cells[np.isfinite(cells)] if cells is not None else np.empty(0)
         if not inclined and known.size and np.ptp(known) > _LEAST_TURN:
-            meanings[name] = Resemblance(REFERENCES["inclination"].column, ABOVE)
+            unit = meanings[name].unit if re.search("in[ck]l", name, re.IGNORECASE) else ABOVE
+            meanings[name] = Resemblance(REFERENCES["inclination"].column, unit)
     if len(inclined) < 2 or any(m.column == REFERENCES["dip"].column for m in meanings.values()):
         return
     steady = [
@@ -1640,12 +1648,14 @@ def _stated_among(names: Sequence[str]) -> bool:
 
 
 def _spoken(meanings: Mapping[str, Resemblance], values: Values, above: Sequence[str]) -> str:
-    """The unit of angles that a line above the table states, or that toolfaces can only have.
+    """The unit of angles that a line above the table states or another angle has, or that toolfaces can only have.
 
     A run needs rolls: toolfaces that are all below 6.3 are in radians, and others are not, whatever a line states.
     """
     text = " ".join(above)
     stated = next((unit for unit, words in _SPOKEN.items() if words.search(text)), "")
+    of_angles = {m.unit for m in meanings.values() if m.column in _ANGLES_AND_WARMTH[:3]}
+    stated = stated or ("gon" if "gon" in of_angles and "°" not in of_angles else "")
     rolls = [
         values(n) for n, m in meanings.items() if m.column == "ref_toolface_deg" and not m.unit
     ]
@@ -1667,10 +1677,10 @@ def _spoken_warmth(above: Sequence[str]) -> str:
     return units[0] if len(units) == 1 else ""
 
 
-def _angles(column: str, unit: str) -> str:
-    """The unit of angles for a column of angles of the stand; empty for others."""
-    stand = column in [REFERENCES[name].column for name in ("inclination", "azimuth", "toolface")]
-    return unit if stand else ""
+def _angles(column: str, unit: str, spoken: str) -> str:
+    """The unit beside a name or, for angles of the stand without one that is known, such as gr, that of their table."""
+    known = unit in units_of(column) or unit_of(unit.partition(",")[0]) or BOTH_UNITS in unit
+    return spoken if spoken and not known and column in _ANGLES_AND_WARMTH[:3] else unit
 
 
 def _check_triads(

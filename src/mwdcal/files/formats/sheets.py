@@ -26,6 +26,8 @@ _BAR = re.compile(r"(?<!\S)\|(?!\S)")
 _FRAME = "!"
 """The sign that old programs draw between columns."""
 _BLANKS, _RUNS = "blanks", "runs of blanks"
+_SIXTIETHS = re.compile(r"[-−]?\d{1,3} [0-5]\d [0-5]\d([.,]\d+)?")
+"""Degrees, minutes and seconds in one cell, which are three numbers wherever blanks part cells."""
 _LOOKED_AT = 400
 """Most lines that tell the delimiter of a text, and most characters that tell a page."""
 _ARCHIVES = (b"\xd0\xcf\x11\xe0", b"PK")
@@ -228,7 +230,11 @@ def _over_one(
 
 def _numbers(rows: Sequence[Sequence[str]]) -> int:
     """Numbers in the rows that have at least four, and as many cells as most of these have."""
-    counts = [(len(row), count) for row in rows if (count := sum(map(figures.is_figure, row))) >= 4]
+    counts = [
+        (len(row), count)
+        for row in rows
+        if (count := sum(3 if _SIXTIETHS.fullmatch(c) else figures.is_figure(c) for c in row)) >= 4
+    ]
     widths = Counter(width for width, _ in counts)
     usual = max(widths, key=lambda width: widths[width], default=0)
     return sum(count for width, count in counts if width == usual)

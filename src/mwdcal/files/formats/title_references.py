@@ -88,7 +88,7 @@ _OF_PLACES = (
 )
 _WRITTEN_UNIT = (
     r"ft\s?/\s?s\s?(?:²|\^?2)|мгс\b|см/с[²2]?|k?γ|(?:(?<=\d)|(?<=\d )|(?<=[(\[]))k?gammas?\b(?! ?ray)|"
-    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss)?\b|gauss|gs\b|oe\b|a\s?/\s?m\b|gals?\b|gons?\b|"
+    r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss|s)?\b|gauss|gs\b|oe\b|a\s?/\s?m\b|gals?\b|gons?\b|"
     r"nano ?teslas?\b|micro ?teslas?\b|нтл|мктл|мтл|м?гал|гс\b|э\b|м/с²?|м/с2|"
     r"m\s?/\s?s\s?(?:²|\^?2)?|[gг]\b(?!\s*[=:(\[]?\s*(?:[+-]?\d|m\s?/))|°|deg\w*|gra[ud]\w*|rad\b|град\w*|"
     r"fok|derece|stopni|度"
@@ -215,9 +215,10 @@ _OF_A_UNIT = re.compile(
     r"(?:(?:^|[(\[,;:])\s*1|(?<![^\W\d_])(?:unit\w*|unidade?|einheit|enhet|enhed|eenheid|jednostka|единиц\w*)|单位)"
     rf"\s*(?:{_WRITTEN_UNIT}|[gг])\s*[=≙≈]\s*(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})|"
     rf"(?<![\w.,])(?:1\s*{_COUNTED}\.?\s*[=≙≈:]|(?:{_WRITTEN_NUMBER})\s*{_COUNTED}\.?\s*[=≙≈])\s*"
-    rf"(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})"
+    rf"(?:{_WRITTEN_NUMBER})\s*(?:{_WRITTEN_UNIT})|"
+    r"(?:(?<=\dg)|(?<=\d g)|(?<=\d; g))\s*[(\[]\W*9[.,]80665\s*m/s²\W*[)\]]"
 )
-"""Definition of a unit: 1 g = 9.80665 m/s²; the size of a volt or of a count: 1 V = 20 µT."""
+"""Definition of a unit: 1 g = 9.80665 m/s², 1.0016 g (9.80665 m/s²); the size of a volt or a count: 1 V = 20 µT."""
 _IN_OTHER_UNIT = re.compile(
     rf"(?P<value>(?P<number>{_WRITTEN_NUMBER})\s*(?P<unit>{_WRITTEN_UNIT}|g\b))[\s;]*"
     rf"(?:[(\[]\s*(?:=|i\.?e\.?|or)?|"
@@ -286,7 +287,7 @@ _UNIT_ALONE = re.compile(rf"(?<![^\W\d_])({_WRITTEN_UNIT})(?![^\W\d_])")
 _NO_PLACE = re.compile(
     rf"{_UNSURE.pattern}|"
     r"horizont\w*|poziom\w*|pionow\w*|skladow\w*|slozk\w*|vertical\w*|vertik\w*|compon\w*|kompon\w*|north|nord|"
-    r"south|sud|coil\w*|spule\w*|scale|scaling|sens\w*|full|skal\w*|empfind\w*|escala|følsom\w*|folsom\w*|"
+    r"south|sud(?!ut)|coil\w*|spule\w*|scale|scaling|sens\w*|full|skal\w*|empfind\w*|escala|følsom\w*|folsom\w*|"
     r"масштаб\w*|чувств\w*|коэфф\w*|比例|"
     r"measured|\bmeas\b|mean|average|\bavg|mittel|gemessen|malt|medid\w*|mesur\w*|media|medio|moyen\w*|средн\w*|"
     r"измер\w*|"
@@ -313,7 +314,7 @@ _AT = re.compile(
 """Words before a strength at which something was checked, unless it is one of several places."""
 _INCLINED = re.compile(
     r"dip|(?<![^\W\d_])[iеe]n[ck]l\w*|inklin\w*|inclin\w*|наклон\w*|нахил\w*|倾|伏角|傾|egim|duzalimi|sklon\w*|"
-    r"nachyleni\w*|"
+    r"nachyleni\w*|dal[ıi]m\w*|көлбеу\w*|"
     r"(?<![^\W\d_])fall(?:vinkel)?(?![^\W\d_])|hajlas\w*|lutning|kallistuma|helling|mergulho|buzamiento|echado",
 )
 """Words of an inclination, which is the field's in a line about a place."""
@@ -345,7 +346,7 @@ _SPELT = {
     "см/с": "gal", "см/с²": "gal", "см/с2": "gal",
     "gs": "gauss", "gals": "gal", "гал": "gal",
     "ft/s": "ft/s²", "ft/s²": "ft/s²", "ft/s2": "ft/s²",
-    "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "milligauss": "mG",
+    "mgal": "mGal", "мгал": "mGal", "mg": "mg", "mgauss": "mG", "mgs": "mG", "milligauss": "mG",
 }  # fmt: skip
 """Units in small letters, where `unit_of` does not know them or goes by capitals."""
 
