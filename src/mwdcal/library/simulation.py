@@ -26,6 +26,7 @@ from mwdcal.library.planning import (
     PlanSource,
     ToolSource,
     check_whole,
+    loaded_tool,
     plan_table,
     profile_of,
     silent,
@@ -325,7 +326,7 @@ class _Scene:
         effects: FilePath | Effects | None, seed: int,
     ) -> _Scene:  # fmt: skip
         """All that is named, read."""
-        from mwdcal.planning.plans import Effects, load_effects
+        from mwdcal.planning.plans import Effects, at_place_of, load_effects
         from mwdcal.planning.session import calibrated_tool
         from mwdcal.presentation.calibration_source import calibration_of
 
@@ -337,7 +338,10 @@ class _Scene:
             physics, digest = load_effects(os.fspath(effects or "none"))
         digests = {"plan": table.digest, "effects": digest if effects else ""}
         if calibration is None:
-            profile, digests["profile"] = profile_of("servo" if tool is None else tool)
+            tool = loaded_tool("servo" if tool is None else tool)
+            profile, digests["profile"] = profile_of(tool)
+            if isinstance(tool, Calibration):
+                table = at_place_of(table, tool)
             return cls(table, profile, physics, digests)
         if tool is not None:
             raise InputError(
@@ -346,7 +350,7 @@ class _Scene:
         if not isinstance(calibration, Calibration):
             calibration, digests["calibration"] = calibration_of(Path(calibration))
         true, profile = calibrated_tool(calibration)
-        return cls(table, profile, physics, digests, calibration, true)
+        return cls(at_place_of(table, calibration), profile, physics, digests, calibration, true)
 
 
 def _order(options: Options) -> int | None:
