@@ -203,9 +203,10 @@ def simulate(*arguments: Any, **choices: Any) -> Any:
     """Simulate a run of a known tool, or a whole procedure many times. Always marked as simulated.
 
     With a plan: `simulate(plan, tool, seed=0)` carries it out with a `tool` drawn from the tolerances of a profile
-    (by default servo), or the tool that a `calibration` describes, on a stand with its errors. The readings have
-    `.truth`. `effects` are a file of what happens besides noise; `order` is that of the tool's temperature terms, by
-    default the highest that the plan's soaks carry.
+    (by default servo), or the tool that a `calibration` describes, on a stand with its errors. A calibration, also as
+    `tool`, gives the gravity, field and dip that the plan does not state. The readings have `.truth`. `effects` are a
+    file of what happens besides noise; `order` is that of the tool's temperature terms, by default the highest that
+    the plan's soaks carry.
 
     With `repeat` the run, fit, roll test and verdict of so many tools, in `.columns`, and how often verdicts are
     wrong in `.risk`. `rolltest` is a plan, `limits` those of the verdict; `options` and further keywords are those of

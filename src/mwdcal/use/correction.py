@@ -222,11 +222,11 @@ RESULTS_BEYOND = (
     f"extrapolated, with no statement of accuracy, and marked in the column '{EXTRAPOLATED}'.",
 )
 """The treatment of results outside the calibrated temperatures."""
-BEYOND = (
+ROWS_BEYOND = (
     "{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
 )
 """Rows outside the calibrated temperatures and their margin."""
-DRIFTING = (
+ROWS_DRIFTING = (
     "{some} of {rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C by up to {most:.1f} °C. The "
     "calibration has no temperature terms, and 1σ contains no drift over the difference: about {turn:.4f}° of "
     "inclination, if a bias drifts by {drift:.1f} µg/°C. Calibrate at several temperatures."
@@ -453,7 +453,7 @@ def findings(
     """
     low, high = calibration.temperature_c or (np.nan, np.nan)
     if tally.beyond and outside == "refuse":
-        beyond = f"{readings.source}: {BEYOND.format(tally=tally, low=low, high=high)}"
+        beyond = f"{readings.source}: {ROWS_BEYOND.format(tally=tally, low=low, high=high)}"
         advice = "Use `outside` blank or extrapolate, or calibrate over a wider range."
         raise InputError(f"{beyond}. {advice}")
     off, tools = strengths.departures(tally.strengths), other_tool(calibration, readings)
@@ -505,7 +505,7 @@ def _away(calibration: Calibration, tally: RowCounts, outside: str) -> str:
         results = RESULTS_BEYOND[outside == "extrapolate"].format(
             margin=margin, low=low - margin, high=high + margin, advice=f"Calibrate {advice}"
         )
-        beyond = BEYOND.format(tally=tally, low=low, high=high)
+        beyond = ROWS_BEYOND.format(tally=tally, low=low, high=high)
         texts.append(f"{beyond}: their results are {results}")
     if some := tally.away - tally.beyond:
         coldest, hottest = tally.warmth
@@ -513,7 +513,7 @@ def _away(calibration: Calibration, tally: RowCounts, outside: str) -> str:
         drift = tolerance(calibration.profile, TRIADS[0], "bias_per_c")
         turn = np.degrees(drift * most)
         texts.append(
-            DRIFTING.format(
+            ROWS_DRIFTING.format(
                 some=some,
                 rows=tally.rows,
                 low=low,
