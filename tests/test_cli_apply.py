@@ -211,6 +211,44 @@ def test_readings_outside_the_calibrated_temperatures_are_blank(tmp_path, warm):
     assert found["station"] == surveys()["station"]
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_rows_whose_uncertainty_lacks_the_drift_with_temperature_are_named(
+    tmp_path, calibration, suffix
+):
+    """Of a calibration at 25 °C; by the datasheet of a servo instrument 100 µg/√3 for each degree, beside 1 g."""
+    near, _ = applied(tmp_path, calibration, surveys([24.1, 25.0, 25.4, 25.9, 24.9]))
+    assert "!" not in near.err.replace("! no serial", "")
+    out = tmp_path / f"out{suffix}"
+    source = write_csv(tmp_path / "warm.csv", surveys([25.0, 25.9, 27.0, 29.9, 20.5]))
+    ran = mwdcal("apply", calibration, source, "-o", out)
+    turn = np.degrees(np.arctan(100e-6 / np.sqrt(3) * 4.9))
+    assert "! 3 of 5 rows lie outside the calibrated range 25.0…25.0 °C by up to 4.9 °C." in ran.err
+    assert f"1σ contains no drift over the difference: about {turn:.4f}° of inclination" in ran.err
+    assert "drift of the sensors with temperature" in ran.out
+    assert "3 of 5 rows" in out.read_bytes().decode("utf-8", "replace")
+
+
+def test_rows_beyond_the_soak_are_blank_and_those_within_it_drift(tmp_path, calibration):
+    ran, path = applied(tmp_path, calibration, surveys([25.0, 28.0, 31.0, 25.0, 10.0]))
+    assert [cell == "" for cell in read_csv(path)["sd_gravity_g"]] == [
+        *2 * (False,),
+        True,
+        False,
+        True,
+    ]
+    assert (
+        "2 of 5 rows lie outside the calibrated range 25.0…25.0 °C: their results are blank"
+        in ran.err
+    )
+    assert "1 of 5 rows lie outside the calibrated range 25.0…25.0 °C by up to" in ran.err
+
+
+def test_temperature_terms_are_in_the_uncertainty(tmp_path, warm):
+    ran, _ = applied(tmp_path, warm, surveys([-0.9, 0.0, 25.0, 50.0, 50.9]))
+    assert "outside the calibrated range" not in ran.err
+    assert "with temperature" not in ran.out
+
+
 def test_readings_outside_may_be_extrapolated(tmp_path, warm):
     ran, path = applied(tmp_path, warm, surveys(OUTSIDE), "--outside", "extrapolate", "--json")
     assert all(numbers(read_csv(path)["inclination_deg"]) >= 0)

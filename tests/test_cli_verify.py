@@ -433,8 +433,9 @@ def test_a_test_of_the_same_soak_is_not_refused(tmp_path, fitted):
     assert "12 of 12 stations (27.5 °C) lie outside the calibrated range 25.0 °C" in ran.err
     out = tmp_path / "o.csv"
     warned = mwdcal("apply", fitted[0], tmp_path / "r.csv", "-o", out).err
-    assert warned.count("!") == 1
+    assert warned.count("!") == 2
     assert "no serial in the calibration and r.csv" in warned
+    assert "12 of 12 rows lie outside the calibrated range 25.0…25.0 °C by up to 2.5 °C" in warned
 
 
 def test_a_test_outside_the_calibrated_temperatures_is_refused(tmp_path, fitted):

@@ -467,6 +467,79 @@ def test_the_tool_of_a_calibration(tmp_path):
     assert command("verify", calibration, roll).code == 0
 
 
+def lasting(temperature):
+    """Without noise, a tool whose accelerometer's z axis drifts by 100 µg/√3 for each degree from 30 °C."""
+    factors = np.zeros((2, 30))
+    factors[:, 0:12:4] = 1.0
+    factors[0, 21] = 100e-6 / np.sqrt(3)
+    steps = {"inclination_deg": (10, 50, 90, 130), "toolfaces": 6, "tool": tuple(factors)}
+    return mwdcal.simulate(**steps, temperature=(temperature,), noise=(1e-9, 1e-4))
+
+
+@pytest.mark.parametrize("apart", [0.9, 2.0, 4.9])
+def test_the_drift_with_temperature_that_1σ_lacks_is_as_large_as_apply_says(apart):
+    """The true error at 90° is the bias itself; below 1 °C it is not named."""
+    result = mwdcal.apply(mwdcal.calibrate(lasting(25.0)), lasting(25.0 + apart))
+    level = np.isclose(result.columns["inclination_deg"], 90, atol=0.1)
+    error = np.abs(result.columns["inclination_deg"][level] - 90)
+    assert error.max() > 100 * result.columns["sd_inclination_deg"][level].max()
+    told = [f.text for f in result.findings if f.id == "outside-temperature"]
+    assert bool(told) is (apart > 1)
+    assert all(f"about {error.max():.4f}° of inclination" in text for text in told)
+
+
+def place_of_tool(known):
+    """A calibration at 47 µT, 0.998 g and a dip of -70°, of which the run states what is `known`."""
+    place = {"field_nt": 47_000.0, "gravity_g": 0.998, "dip_deg": -70.0}
+    columns = mwdcal.plan("servo").columns
+    true = {f"ref_{name}": np.full(24, value) for name, value in place.items()}
+    run = mwdcal.simulate({**columns, **true}, seed=3)
+    hidden = {"field": "field_nt", "gravity": "gravity_g", "dip": "dip_deg"}.keys() - {*known}
+    return mwdcal.calibrate(
+        replace(run, known={n: v for n, v in run.known.items() if n not in hidden})
+    )
+
+
+@pytest.mark.parametrize("way", ["tool", "calibration"])
+def test_a_simulated_run_is_at_the_place_of_the_calibration_unless_the_plan_states_one(way):
+    """The dip, which no station states, is the one that the run estimated."""
+    made = place_of_tool(["field", "gravity"])
+    earth = mwdcal.simulate("twenty-four-state", **{way: made}).truth["earth"]
+    assert earth["dip_deg"] == pytest.approx(-70, abs=0.1)
+    assert (earth["gravity_g"], earth["field_nt"]) == pytest.approx((0.998, 47_000.0))
+    stated = {**mwdcal.plan("servo").columns, "ref_dip_deg": np.full(24, 20.0)}
+    earth = mwdcal.simulate(stated, **{way: made}).truth["earth"]
+    assert tuple(earth.values()) == pytest.approx((0.998, 47_000.0, 20.0))
+
+
+def test_the_roll_test_of_a_repetition_is_at_the_place_of_its_plan():
+    """It has that of the calibration, or else what the plan states; a blank column states nothing."""
+    made = place_of_tool(["field", "gravity", "dip"])
+    roll = load_plan("roll-test").columns
+    blank = {**roll, "ref_dip_deg": np.full(12, np.nan)}
+    for dip, plan in ((-70.0, "twenty-four-state"), (20.0, None)):
+        stated = plan or {**mwdcal.plan("servo").columns, "ref_dip_deg": np.full(24, dip)}
+        for rolltest in ("roll-test", blank):
+            many = mwdcal.simulate(stated, calibration=made, repeat=1, rolltest=rolltest)
+            for session in (many.procedure.calibrating, many.procedure.testing):
+                np.testing.assert_allclose(np.degrees(session.readings.known["dip"]), dip)
+                np.testing.assert_allclose(session.readings.known["field"], 47_000.0)
+
+
+@pytest.mark.parametrize(
+    "line", [("plan", "--tool"), ("simulate", "--tool"), ("simulate", "--calibration")]
+)
+def test_a_calibration_without_nanotesla_says_what_a_plan_needs(tmp_path, line):
+    made = place_of_tool(["dip", "gravity"])
+    mwdcal.save(made, path := tmp_path / "relative.json")
+    message = refused(command(*line, path, "-o", tmp_path / "out.csv"), 2)
+    assert "calibrated to field = 1, and plans and simulations need nT" in message
+    assert (
+        "Add ref_field_nt to the run and calibrate again, or name a tool profile by --tool."
+        in message
+    )
+
+
 def test_the_tool_of_a_warm_calibration_is_written_as_convert_writes_it(tmp_path):
     """One that is linear in its parameters over temperature has no factors."""
     _, run, _ = simulate(tmp_path, "run", plan="moosavi-30")

@@ -18,7 +18,7 @@ import numpy as np
 from mwdcal.app.messages import say
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.readings import TRIADS, Readings, is_simulated
-from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.record import MARGIN, Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import contract, runs, streams, synonyms
 from mwdcal.files.contract import (
@@ -91,6 +91,7 @@ WORST_ROWS = RowCounts(
     strengths=dict.fromkeys(strengths.JUDGED_STRENGTHS, _OFF),
     warmth=TEMPERATURE[:2],
     valueless=_MOST,
+    away=2 * _MOST,
     scatter=dict.fromkeys(
         correction.STEADY_CHANGES, correction.Scatter(1, 1, -1.23e9, 1.23e9, 1.2e-100)
     ),
@@ -317,6 +318,7 @@ class _Worker:
             strengths.judged(self.calibration, columns, known),
             correction.warmth(*channels.get("temperature", [None])), {}, valueless,
             correction.scatters(self.calibration, readings, columns), correction.angle_ranges(columns),
+            int(self.calibration.outside(readings, MARGIN).sum()),
         )  # fmt: skip
         return rendered, part.size, tally
 

@@ -171,7 +171,7 @@ def plan(
         raise InputError("`plan`: one plan holds the candidates to choose from. Name it alone.")
     _check_wanted(stations, accuracy_deg or {})
     planned.check_criterion(criterion)
-    profile, digest = profile_of(tool := _loaded(tool))
+    profile, digest = profile_of(tool := loaded_tool(tool))
     chosen, ends = with_choices(options, choices), _ends(reach or {})
     stand = Stand(speed, settle, soak, ends)
     tables = [plan_table(cast(PlanSource, each)) for each in several]
@@ -252,7 +252,7 @@ def _ends(reach: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, fl
     return ends
 
 
-def _loaded(tool: Any) -> Any:
+def loaded_tool(tool: Any) -> Any:
     """A tool as it is given, or the calibration in the file that it names."""
     file = isinstance(tool, str | os.PathLike) and Path(tool).suffix.lower() == ".json"
     return documents.read(tool) if file else tool
@@ -260,7 +260,7 @@ def _loaded(tool: Any) -> Any:
 
 def profile_of(tool: object) -> tuple[Profile, str]:
     """A profile and the SHA-256 of its file, or of its calibration; without one for a profile in memory."""
-    tool = _loaded(tool)
+    tool = loaded_tool(tool)
     if isinstance(tool, Calibration):
         from mwdcal.planning.session import calibrated_profile
 

@@ -26,6 +26,7 @@ from mwdcal.library.planning import (
     PlanSource,
     ToolSource,
     check_whole,
+    loaded_tool,
     plan_table,
     profile_of,
     silent,
@@ -202,9 +203,10 @@ def simulate(*arguments: Any, **choices: Any) -> Any:
     """Simulate a run of a known tool, or a whole procedure many times. Always marked as simulated.
 
     With a plan: `simulate(plan, tool, seed=0)` carries it out with a `tool` drawn from the tolerances of a profile
-    (by default servo), or the tool that a `calibration` describes, on a stand with its errors. The readings have
-    `.truth`. `effects` are a file of what happens besides noise; `order` is that of the tool's temperature terms, by
-    default the highest that the plan's soaks carry.
+    (by default servo), or the tool that a `calibration` describes, on a stand with its errors. A calibration, also as
+    `tool`, gives the gravity, field and dip that the plan does not state. The readings have `.truth`. `effects` are a
+    file of what happens besides noise; `order` is that of the tool's temperature terms, by default the highest that
+    the plan's soaks carry.
 
     With `repeat` the run, fit, roll test and verdict of so many tools, in `.columns`, and how often verdicts are
     wrong in `.risk`. `rolltest` is a plan, `limits` those of the verdict; `options` and further keywords are those of
@@ -325,7 +327,7 @@ class _Scene:
         effects: FilePath | Effects | None, seed: int,
     ) -> _Scene:  # fmt: skip
         """All that is named, read."""
-        from mwdcal.planning.plans import Effects, load_effects
+        from mwdcal.planning.plans import Effects, at_place_of, load_effects
         from mwdcal.planning.session import calibrated_tool
         from mwdcal.presentation.calibration_source import calibration_of
 
@@ -337,7 +339,10 @@ class _Scene:
             physics, digest = load_effects(os.fspath(effects or "none"))
         digests = {"plan": table.digest, "effects": digest if effects else ""}
         if calibration is None:
-            profile, digests["profile"] = profile_of("servo" if tool is None else tool)
+            tool = loaded_tool("servo" if tool is None else tool)
+            profile, digests["profile"] = profile_of(tool)
+            if isinstance(tool, Calibration):
+                table = at_place_of(table, tool)
             return cls(table, profile, physics, digests)
         if tool is not None:
             raise InputError(
@@ -346,7 +351,7 @@ class _Scene:
         if not isinstance(calibration, Calibration):
             calibration, digests["calibration"] = calibration_of(Path(calibration))
         true, profile = calibrated_tool(calibration)
-        return cls(table, profile, physics, digests, calibration, true)
+        return cls(at_place_of(table, calibration), profile, physics, digests, calibration, true)
 
 
 def _order(options: Options) -> int | None:

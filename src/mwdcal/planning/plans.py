@@ -242,12 +242,18 @@ def at_temperatures(plan: Table, other: Table) -> Table:
 
 def at_place(plan: Table, other: Table) -> Table:
     """A plan with the gravity, field and dip that another states first, where that states any."""
-    place = {}
-    for name in (REFERENCES[constant].column for constant in CONSTANTS):
-        stated = np.asarray(other.columns.get(name, ()), float)
-        for value in stated[~np.isnan(stated)][:1]:
-            place[name] = np.full(plan.count, value)
+    place = {column: np.full(plan.count, value) for column, value in stated_place(other).items()}
     return replace(plan, columns={**plan.columns, **place})
+
+
+def stated_place(plan: Table) -> dict[str, float]:
+    """Gravity, field and dip that a plan states first, by column."""
+    place = {}
+    for column in (REFERENCES[constant].column for constant in CONSTANTS):
+        stated = np.asarray(plan.columns.get(column, ()), float)
+        if not np.isnan(stated).all():
+            place[column] = float(stated[~np.isnan(stated)][0])
+    return place
 
 
 def place_of(calibration: Calibration) -> dict[str, float]:
@@ -263,12 +269,14 @@ def place_of(calibration: Calibration) -> dict[str, float]:
 
 def at_place_of(plan: Table, calibration: Calibration) -> Table:
     """A plan with the gravity, field and dip of a calibration where the plan states none."""
-    place = {
-        column: np.full(plan.count, value)
-        for column, value in place_of(calibration).items()
-        if np.isnan(np.asarray(plan.columns.get(column, ()), float)).all()
-    }
-    return replace(plan, columns={**plan.columns, **place})
+    return with_place(plan, place_of(calibration))
+
+
+def with_place(plan: Table, place: Mapping[str, float]) -> Table:
+    """A plan with the values of a place, by column, where the plan states none."""
+    known = stated_place(plan)
+    added = {name: np.full(plan.count, place[name]) for name in place if name not in known}
+    return replace(plan, columns={**plan.columns, **added})
 
 
 def without_estimates(plan: Table, calibration: Calibration) -> Table:

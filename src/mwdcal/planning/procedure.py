@@ -25,14 +25,13 @@ from mwdcal.calibration.results import STATED_ANGLES, accuracy, middle_temperatu
 from mwdcal.errors import FitError, InputError
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.estimation.uncertainty import Free
-from mwdcal.files.contract import REFERENCES
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_fit
 from mwdcal.planning.planned import WORKING_INCLINATIONS
-from mwdcal.planning.plans import Effects, Truth, drawn
+from mwdcal.planning.plans import Effects, Truth, drawn, stated_place, with_place
 from mwdcal.planning.session import Session
 from mwdcal.sensor.profile import Profile
 from mwdcal.use import roll_test
@@ -109,11 +108,7 @@ class Procedure:
         calibration = recorded(choice, result)
         if free := left_undetermined(calibration):
             raise FitError(f"{plan.source} leaves a direction undetermined: {free[0].text}.")
-        place = {REFERENCES[name].column for name in CONSTANTS} & {*plan.columns}
-        there = {
-            name: np.full(test.count, plan.columns[name][0]) for name in place - {*test.columns}
-        }
-        testing = Session.of(replace(test, columns={**test.columns, **there}), profile, effects)
+        testing = Session.of(with_place(test, stated_place(plan)), profile, effects)
         if tool and tool.magnetometer is None:  # no limit of azimuth, field or dip then
             testing = replace(testing, readings=replace(testing.readings, magnetometer=None))
         most = max(choice.options.orders) if order is None else order

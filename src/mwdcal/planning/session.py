@@ -149,8 +149,8 @@ def calibrated_profile(calibration: Calibration) -> Profile:
     """
     if calibration.relative and calibration.has_field:
         raise InputError(
-            f"`calibration`: the magnetometer of {calibration.run_name} is calibrated to field = 1, and reads no "
-            "nT. Calibrate with ref_field_nt."
+            f"the magnetometer of {calibration.run_name} is calibrated to field = 1, and plans and simulations "
+            "need nT. Add ref_field_nt to the run and calibrate again, or name a tool profile by `tool`."
         )
     profile = calibration.profile
     for triad in calibration.triads:

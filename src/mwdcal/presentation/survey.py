@@ -219,7 +219,7 @@ def refusal(inputs: WellInputs, msa: MultiStationAnalysis) -> SurveySummary:
         blind=0,
         blank=rows,
         north=north.name,
-        **_stated(north, error_terms((), north.declination is not None)),
+        **_stated(north, error_terms(inputs.calibration, north.declination is not None)),
         error_model=inputs.model.name if inputs.model else "none",
         years_since_calibration=None,
         random_walk=False,

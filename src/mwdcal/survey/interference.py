@@ -247,7 +247,7 @@ class Interference:
     @property
     def terms(self) -> ErrorTerms:
         """Sources in the standard uncertainties of magnetic azimuths, and those left out."""
-        return error_terms(self.calibration.findings, declination=False)
+        return error_terms(self.calibration, declination=False)
 
     @property
     def refusal(self) -> str:

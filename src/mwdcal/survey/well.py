@@ -515,9 +515,7 @@ class Well:
     def terms(self) -> ErrorTerms:
         """Sources in the standard uncertainties, and those left out."""
         modelled = () if self.errors is None else self.errors.included
-        return error_terms(
-            self.calibration.findings, self.north.declination is not None, modelled=modelled
-        )
+        return error_terms(self.calibration, self.north.declination is not None, modelled=modelled)
 
     @property
     def blank(self) -> Bools:

@@ -17,8 +17,8 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.diagnosis.identity import doubts, other_tool
-from mwdcal.calibration.readings import Readings
-from mwdcal.calibration.record import Calibration, Finding
+from mwdcal.calibration.readings import TRIADS, Readings
+from mwdcal.calibration.record import MARGIN, Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import (
     EXTRAPOLATED,
@@ -29,6 +29,7 @@ from mwdcal.geometry.observables import (
     VECTORS,
 )
 from mwdcal.geometry.vectors import AnyArray, Array
+from mwdcal.sensor.profile import tolerance
 from mwdcal.use import correction_numba, strengths
 from mwdcal.use.strengths import Strengths
 from mwdcal.use.uncertainty import (
@@ -199,7 +200,7 @@ ROW_FINDINGS = {
     "no-magnetometer": "no columns mx, my, mz: magnetic results are blank.",
     "other-tool": "the readings are of tool {tools[1]}, the calibration of tool {tools[0]}: is it the right one?",
     "missing-reading": "{tally.lacking} of {tally.rows} rows lack a reading: their results are blank.",
-    "outside-temperature": "{beyond}: their results are {results}",
+    "outside-temperature": "{away}",
     "no-temperature": "the calibration has no temperature terms, and its run recorded no temperature{readings_at}.",
     "temperature-unknown": f"{UNKNOWN_TEMPERATURE}.",
     "implausible-gravity": "{off[gravity]}: the tool moved while it was read, or a reading is in another unit.",
@@ -221,6 +222,16 @@ RESULTS_BEYOND = (
     f"extrapolated, with no statement of accuracy, and marked in the column '{EXTRAPOLATED}'.",
 )
 """The treatment of results outside the calibrated temperatures."""
+ROWS_BEYOND = (
+    "{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
+)
+"""Rows outside the calibrated temperatures and their margin."""
+ROWS_DRIFTING = (
+    "{some} of {rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C by up to {most:.1f} °C. The "
+    "calibration has no temperature terms, and 1σ contains no drift over the difference: about {turn:.4f}° of "
+    "inclination, if a bias drifts by {drift:.1f} µg/°C. Calibrate at several temperatures."
+)
+"""Rows whose 1σ lacks the drift of the sensors from the calibrated temperatures."""
 COMPILED_ROWS = 300_000
 """Number of rows from which the compiled loops repay their loading."""
 
@@ -240,7 +251,8 @@ class AngleRange(msgspec.Struct, frozen=True):
 class RowCounts(NamedTuple):
     """Rows of a table, counted by what the findings report of them.
 
-    `beyond`: outside the calibrated temperatures; `moved`: outputs that rest on a free direction;
+    `beyond`: outside the calibrated temperatures and their margin; `away`: outside by more than `MARGIN`, with those
+    `beyond`; `moved`: outputs that rest on a free direction;
     `lacking`: without a reading; `warmth`: lowest and highest temperature, °C; `metadata`: what the
     table says of itself; `valueless`: with a direction that has no value; `angles`: ranges of
     inclination and azimuth, where there are any.
@@ -257,6 +269,7 @@ class RowCounts(NamedTuple):
     valueless: int = 0
     scatter: Mapping[str, Scatter] = {}
     angles: Mapping[str, AngleRange] = {}
+    away: int = 0
 
     def blank(self, outside: str) -> int:
         """Number of rows without results: without a reading, or `outside` the temperatures."""
@@ -316,7 +329,7 @@ def tallied(
         readings.count + lacking, int(beyond.sum()), undetermined(calibration, readings), lacking, (),
         strengths.judged(calibration, columns, readings.known), warmth(readings.temperature),
         readings.metadata, valueless, scatters(calibration, readings, columns) if whole else {},
-        angle_ranges(columns) if whole else {},
+        angle_ranges(columns) if whole else {}, int(calibration.outside(readings, MARGIN).sum()),
     )  # fmt: skip
     if outside == "extrapolate":
         columns[EXTRAPOLATED] = beyond
@@ -325,8 +338,8 @@ def tallied(
 
 def joined(tallies: Sequence[RowCounts]) -> RowCounts:
     """The counts of the parts of a table together; serials and metadata are those of the first."""
-    counts = [(t.rows, t.beyond, t.lacking, t.valueless) for t in tallies]
-    rows, beyond, lacking, valueless = np.sum(counts, 0).tolist()
+    counts = [(t.rows, t.beyond, t.lacking, t.valueless, t.away) for t in tallies]
+    rows, beyond, lacking, valueless, away = np.sum(counts, 0).tolist()
     lows, highs = zip(*(tally.warmth for tally in tallies), strict=True)
     moved = {name for tally in tallies for name in tally.moved}
     return tallies[0]._replace(
@@ -334,7 +347,7 @@ def joined(tallies: Sequence[RowCounts]) -> RowCounts:
         lacking=lacking, strengths=strengths.total(tally.strengths for tally in tallies),
         warmth=(min(lows), max(highs)), valueless=valueless,
         scatter=total(tally.scatter for tally in tallies),
-        angles=_joined_ranges([tally.angles for tally in tallies]),
+        angles=_joined_ranges([tally.angles for tally in tallies]), away=away,
     )  # fmt: skip
 
 
@@ -439,17 +452,17 @@ def findings(
     Of the readings only the metadata are used, and whether there is a magnetometer.
     """
     low, high = calibration.temperature_c or (np.nan, np.nan)
-    beyond = f"{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
     if tally.beyond and outside == "refuse":
+        beyond = f"{readings.source}: {ROWS_BEYOND.format(tally=tally, low=low, high=high)}"
         advice = "Use `outside` blank or extrapolate, or calibrate over a wider range."
-        raise InputError(f"{readings.source}: {beyond}. {advice}")
+        raise InputError(f"{beyond}. {advice}")
     off, tools = strengths.departures(tally.strengths), other_tool(calibration, readings)
     changing = unsteady(tally.scatter)
     applies = {
         "no-magnetometer": calibration.has_field and readings.magnetometer is None,
         "other-tool": tools,
         "missing-reading": tally.lacking,
-        "outside-temperature": tally.beyond,
+        "outside-temperature": tally.away,
         "no-temperature": calibration.temperature_c is None,
         "temperature-unknown": bool(calibration.temperature_c) and tally.warmth[0] == np.inf,
         "implausible-gravity": "gravity" in off,
@@ -463,9 +476,8 @@ def findings(
     warm = "…".join(dict.fromkeys(f"{end:.1f}" for end in tally.warmth))
     unknown = f": nothing says how good the results are at the readings' {warm} °C"
     words = {
-        "beyond": beyond,
         "calibrated": f"{low:.1f}…{high:.1f} °C",
-        "results": _results_beyond(calibration, outside),
+        "away": _away(calibration, tally, outside),
         "readings_at": unknown if calibration.unrecorded(readings) else "",
         "unsteady": changing,
         "odd": odd_rows(tally.scatter),
@@ -484,16 +496,34 @@ def findings(
     )
 
 
-def _results_beyond(calibration: Calibration, outside: str) -> str:
-    """The treatment of results outside the calibrated temperatures, with the remedy."""
-    low, high = calibration.valid_temperatures or (np.nan, np.nan)
-    advice = (
-        "Calibrate over a wider range"
-        if calibration.thermal
-        else "Calibrate at several temperatures"
-    )
-    text = RESULTS_BEYOND[outside == "extrapolate"]
-    return text.format(margin=calibration.margin, low=low, high=high, advice=advice)
+def _away(calibration: Calibration, tally: RowCounts, outside: str) -> str:
+    """The rows outside the calibrated temperatures: those without accuracy, and those whose 1σ lacks a drift."""
+    (low, high), margin = calibration.temperature_c or (np.nan, np.nan), calibration.margin
+    texts = []
+    if tally.beyond:
+        advice = "over a wider range" if calibration.thermal else "at several temperatures"
+        results = RESULTS_BEYOND[outside == "extrapolate"].format(
+            margin=margin, low=low - margin, high=high + margin, advice=f"Calibrate {advice}"
+        )
+        beyond = ROWS_BEYOND.format(tally=tally, low=low, high=high)
+        texts.append(f"{beyond}: their results are {results}")
+    if some := tally.away - tally.beyond:
+        coldest, hottest = tally.warmth
+        most = min(max(low - coldest, hottest - high), margin)
+        drift = tolerance(calibration.profile, TRIADS[0], "bias_per_c")
+        turn = np.degrees(drift * most)
+        texts.append(
+            ROWS_DRIFTING.format(
+                some=some,
+                rows=tally.rows,
+                low=low,
+                high=high,
+                most=most,
+                turn=turn,
+                drift=drift * 1e6,
+            )
+        )
+    return " ".join(texts)
 
 
 def warn_if_blank(columns: Mapping[str, AnyArray], findings: Iterable[Finding]) -> None:

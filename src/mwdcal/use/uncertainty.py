@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mwdcal.calibration.readings import TRIADS, Readings
-from mwdcal.calibration.record import Calibration, Finding, TriadCalibration
+from mwdcal.calibration.record import Calibration, TriadCalibration
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS, UNCERTAINTIES, VECTORS, variances
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, diagonal
 
@@ -46,6 +46,8 @@ INTERFERENCE = "interference of the drill string"
 AXIAL_INTERFERENCE, CROSS_INTERFERENCE = f"axial {INTERFERENCE}", f"cross-axial {INTERFERENCE}"
 """Interference of the drill string as error models part it: they state the first alone."""
 DRIFT = "drift of the sensors since the calibration"
+THERMAL_DRIFT = "drift of the sensors with temperature"
+"""The drift that a calibration without temperature terms does not know."""
 NEVER = ("sag", "misalignment in the hole")
 """Errors that no calibration and no survey of its own knows…"""
 DEPTH = "measured depth"
@@ -74,17 +76,17 @@ class ErrorTerms:
 
 
 def error_terms(
-    findings: Iterable[Finding],
+    calibration: Calibration,
     declination: bool,
     depth: bool = True,
     modelled: Iterable[str] = (),
 ) -> ErrorTerms:
-    """Those of readings by a calibration with these findings.
+    """Those of readings by a calibration.
 
     `declination`: azimuths count from another north. `depth`: the readings are surveys of a well. `modelled`: what an
     error model adds: `AXIAL_INTERFERENCE`, `DRIFT`, `DEPTH` and of `NEVER`.
     """
-    there, model = {finding.id for finding in findings}, set(modelled)
+    there, model = {finding.id for finding in calibration.findings}, set(modelled)
     parts = {INTERFERENCE: CORRECTED in there}
     if AXIAL_INTERFERENCE in model:
         parts = {AXIAL_INTERFERENCE: True, CROSS_INTERFERENCE: False}
@@ -97,12 +99,14 @@ def error_terms(
     included = [name for name, known in optional.items() if known]
     north = ["declination"] if declination else []
     left_out = [name for name, known in optional.items() if not known]
+    if not calibration.thermal and DRIFTED not in there:
+        left_out.append(THERMAL_DRIFT)
     return ErrorTerms(("calibration", "noise", *north, *included), tuple(left_out))
 
 
 def reading_terms(calibration: Calibration) -> ErrorTerms:
     """Those of corrected readings: angles count from magnetic north, and there is no depth."""
-    return error_terms(calibration.findings, declination=False, depth=False)
+    return error_terms(calibration, declination=False, depth=False)
 
 
 def standard_uncertainties(

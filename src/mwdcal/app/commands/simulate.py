@@ -32,12 +32,15 @@ ALWAYS = ("plan", "tool", "calibration", "order", "effects", "seed", "output", "
     default="twenty-four-state",
     help="A built-in plan, a TOML file of attitudes, or a run file.",
 )
-@options.tool(help="Profile from whose tolerances the tool is drawn. Default: servo.")
+@options.tool(
+    help="Profile, or that of a calibration, from whose tolerances the tool is drawn. Default: servo."
+)
 @click.option(
     "--calibration",
     type=options.FILE,
     metavar="CAL.json",
-    help="The tool that this calibration describes, instead of one drawn.",
+    help="The tool that this calibration describes, instead of one drawn. It gives the gravity, field and dip that the "
+    "plan does not state.",
 )
 @click.option(
     "--effects",
