@@ -86,6 +86,13 @@ REFERENCES = {
     "field": Reference("ref_field_nt", Range(0, 200_000, "nT", True), Range(0, 200_000, "nT"), 1.0),
     "dip": _angle("dip", -90.0, 90.0),
 }
+
+
+def is_angle(column: str) -> bool:
+    """Whether a column has angles of the stand or of the field."""
+    return column.startswith("ref_") and column.endswith("_deg")
+
+
 TEMPERATURE = Range(-273.15, 1000.0, "°C")
 RAW_RANGE = Range(-1e15, 1e15, "")
 RAW_SPREAD = Range(0.0, 1e15, "")
