@@ -32,6 +32,7 @@ from mwdcal.files.contract import (
     AZIMUTH_KEYS,
     CHANNELS,
     COLUMNS,
+    DAY,
     RANGES,
     RAW,
     REFERENCE_VECTORS,
@@ -638,7 +639,7 @@ def to_readings(
         source=table.source,
         sheet=table.sheet,
         run_sha256=table.digest,
-        unused=synonyms.unused(list(table.columns), COLUMNS),
+        unused=synonyms.unused(list(table.columns), {*COLUMNS, *DAY.intersection(table.metadata)}),
         remarks=table.remarks,
         not_taken={c: line for c, line in table.not_taken.items() if c not in table.columns},
     )

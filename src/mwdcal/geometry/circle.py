@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Ints
+from mwdcal.geometry.vectors import AnyArray, Array, Ints
 
 WHOLE_TURN = 360.0
 """Degrees of a circle: angles of files are in degrees."""
@@ -18,9 +18,9 @@ def resultant(angles: Array) -> AnyArray:
     return np.asarray(np.mean(np.exp(1j * angles), -1))
 
 
-def _nearest(angles: ArrayLike, about: ArrayLike, turn: float = WHOLE_TURN) -> Array:
+def _nearest(angles: Array, about: Array, turn: float) -> Array:
     """Angles with the whole turns added that bring them within half a turn of others."""
-    return np.asarray(angles + turn * np.round((np.asarray(about) - angles) / turn))
+    return np.asarray(angles + turn * np.round((about - angles) / turn))
 
 
 def unrolled(angles: Array, turn: float = WHOLE_TURN, starts: Ints | None = None) -> Array:

@@ -6,9 +6,13 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
+from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
+
 from mwdcal.files.formats.columns import as_text, without_marks
+from mwdcal.geometry.vectors import Array
 
 UNITS_BY_SIGN = {
     "°": "deg",
@@ -328,6 +332,13 @@ def day_of(text: str, day_first: bool = False) -> str:
     `day_first`: of 03/04/2025 the 3 is the day, as everywhere but in English. With AM or PM the month is first.
     """
     first, *time = re.split(r"[T ]+(?=\d\d?:)", text.strip(), maxsplit=1)
+    american = bool(time) and time[0].rstrip(".").upper().endswith(("AM", "PM"))
+    return _day_without_time(first, american, day_first)
+
+
+@lru_cache(maxsize=64)  # rows of one day differ by their times
+def _day_without_time(first: str, american: bool, day_first: bool) -> str:
+    """A day in ISO form, or empty: see `day_of`."""
     for form in _DAYS:
         try:
             return datetime.strptime(first, form).date().isoformat()
@@ -337,19 +348,19 @@ def day_of(text: str, day_first: bool = False) -> str:
     if not match:
         return ""
     one, two = int(match[1]), int(match[3])
-    american = bool(time) and time[0].rstrip(".").upper().endswith(("AM", "PM"))
     orders = [(one, two)] if day_first else [(two, one)] if american else [(one, two), (two, one)]
     days = {f"{match[4]}-{m:02d}-{d:02d}" for d, m in orders if 0 < m <= 12 and 0 < d <= 31}
     return days.pop() if len(days) == 1 else ""
 
 
 def dated(
-    metadata: Mapping[str, object], columns: Iterable[tuple[str, Sequence[str]]]
+    metadata: Mapping[str, object], columns: Iterable[tuple[str, Sequence[str] | Array]]
 ) -> dict[str, object]:
     """Metadata with the day of a column of times, where they have no date."""
     if "date" in metadata:
         return dict(metadata)
-    day = next(filter(None, (_day_of_cells(name, cells) for name, cells in columns)), "")
+    texts = ((name, cells) for name, cells in columns if not isinstance(cells, np.ndarray))
+    day = next(filter(None, (_day_of_cells(name, cells) for name, cells in texts)), "")
     return {**metadata, "date": day} if day else dict(metadata)
 
 
