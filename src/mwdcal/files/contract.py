@@ -107,7 +107,7 @@ RANGES = {
 }
 """The columns of numbers, and their accepted values."""
 COLUMNS = ("station", "group", *RANGES)
-DAY = frozenset({"date"})
+COLUMN_OF_DAY = frozenset({"date"})
 """The column, and the metadata key, of the day of a run."""
 REFERENCE_VECTORS = tuple(f"ref_{name}_{'g' if name[0] == 'a' else 'nt'}" for name in RAW)
 """Components along the tool axes of gravity and field as the stand states them, instead of angles and strengths."""

@@ -31,8 +31,8 @@ from mwdcal.files import synonyms
 from mwdcal.files.contract import (
     AZIMUTH_KEYS,
     CHANNELS,
+    COLUMN_OF_DAY,
     COLUMNS,
-    DAY,
     RANGES,
     RAW,
     REFERENCE_VECTORS,
@@ -639,7 +639,9 @@ def to_readings(
         source=table.source,
         sheet=table.sheet,
         run_sha256=table.digest,
-        unused=synonyms.unused(list(table.columns), {*COLUMNS, *DAY.intersection(table.metadata)}),
+        unused=synonyms.unused(
+            list(table.columns), {*COLUMNS, *COLUMN_OF_DAY.intersection(table.metadata)}
+        ),
         remarks=table.remarks,
         not_taken={c: line for c, line in table.not_taken.items() if c not in table.columns},
     )

@@ -18,7 +18,7 @@ from mwdcal.calibration.diagnosis.flags import Alone
 from mwdcal.calibration.readings import TRIADS, Readings, group_numbers
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.estimation.batch import held_once
-from mwdcal.files.contract import COLUMNS, DAY, RANGES, faults
+from mwdcal.files.contract import COLUMN_OF_DAY, COLUMNS, RANGES, faults
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.columns import as_text, shown
 from mwdcal.files.formats.table import Table
@@ -102,7 +102,7 @@ class Rows:
         if run := self._run(tool, str(serial)):
             return to_readings(run, self.profile)
         lines = (part.column("#row").to_numpy() + 1).tolist()
-        names = [name for name in part.column_names if name in (*COLUMNS, *DAY)]
+        names = [name for name in part.column_names if name in (*COLUMNS, *COLUMN_OF_DAY)]
         columns = {name: parquet.as_column(name, part.column(name), arrow) for name in names}
         place = self.source if self.source.endswith(".parquet") else f"{self.source}/*.parquet"
         source = f"serial {serial} of {place}"

@@ -174,7 +174,7 @@ class FleetTable:
     @property
     def used(self) -> tuple[str, ...]:
         """The columns that a run has, and the serial."""
-        known = (*contract.COLUMNS, *contract.DAY, SERIAL, OFFSET, RUN_FILE, FAULT)
+        known = (*contract.COLUMNS, *contract.COLUMN_OF_DAY, SERIAL, OFFSET, RUN_FILE, FAULT)
         return tuple(name for name in self.columns if name in known)
 
     @property

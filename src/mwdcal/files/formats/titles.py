@@ -6,12 +6,11 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from mwdcal.files.formats.columns import as_text, without_marks
+from mwdcal.files.formats.columns import LABELS, as_text, looks_numeric, without_marks
 from mwdcal.geometry.vectors import Array
 
 UNITS_BY_SIGN = {
@@ -332,13 +331,6 @@ def day_of(text: str, day_first: bool = False) -> str:
     `day_first`: of 03/04/2025 the 3 is the day, as everywhere but in English. With AM or PM the month is first.
     """
     first, *time = re.split(r"[T ]+(?=\d\d?:)", text.strip(), maxsplit=1)
-    american = bool(time) and time[0].rstrip(".").upper().endswith(("AM", "PM"))
-    return _day_without_time(first, american, day_first)
-
-
-@lru_cache(maxsize=64)  # rows of one day differ by their times
-def _day_without_time(first: str, american: bool, day_first: bool) -> str:
-    """A day in ISO form, or empty: see `day_of`."""
     for form in _DAYS:
         try:
             return datetime.strptime(first, form).date().isoformat()
@@ -348,6 +340,7 @@ def _day_without_time(first: str, american: bool, day_first: bool) -> str:
     if not match:
         return ""
     one, two = int(match[1]), int(match[3])
+    american = bool(time) and time[0].rstrip(".").upper().endswith(("AM", "PM"))
     orders = [(one, two)] if day_first else [(two, one)] if american else [(one, two), (two, one)]
     days = {f"{match[4]}-{m:02d}-{d:02d}" for d, m in orders if 0 < m <= 12 and 0 < d <= 31}
     return days.pop() if len(days) == 1 else ""
@@ -356,23 +349,22 @@ def _day_without_time(first: str, american: bool, day_first: bool) -> str:
 def dated(
     metadata: Mapping[str, object], columns: Iterable[tuple[str, Sequence[str] | Array]]
 ) -> dict[str, object]:
-    """Metadata with the day of a column of times, where they have no date."""
+    """Metadata with the one day of all cells of a column of dates or times, where they have no date."""
     if "date" in metadata:
         return dict(metadata)
-    texts = ((name, cells) for name, cells in columns if not isinstance(cells, np.ndarray))
-    day = next(filter(None, (_day_of_cells(name, cells) for name, cells in texts)), "")
-    return {**metadata, "date": day} if day else dict(metadata)
-
-
-def _day_of_cells(name: str, cells: Sequence[str]) -> str:
-    """The one day of all cells of a column of times; empty if there is no day, or there are several days."""
-    day = ""
-    for cell in filter(None, cells):
-        each = day_of(cell, not _ENGLISH_DATE.match(name))
-        if not each or (day and each != day):
-            return ""
-        day = each
-    return day
+    for name, cells in columns:
+        if name in LABELS or isinstance(cells, np.ndarray):
+            continue
+        day, first = "", not _ENGLISH_DATE.match(name)
+        for cell in dict.fromkeys(filter(None, cells)):
+            each = "" if looks_numeric(cell) else day_of(cell, first)
+            if not each or (day and each != day):
+                day = ""
+                break
+            day = each
+        if day:
+            return {**metadata, "date": day}
+    return dict(metadata)
 
 
 _MEANT = {_word(word): key for key, words in _TITLE_WORDS.items() for word in words.split()}
