@@ -120,6 +120,35 @@ def test_tables_as_another_program_writes_them(lab):
         check_same(by_serial(table, serial), alone(run, *FIT, tool=profile))
 
 
+DAYS = {
+    "one day": (["2026-03-04"] * 28, "2026-03-04"),
+    "times of a day": ([f"04.03.2026 10:{minute}" for minute in range(10, 38)], "2026-03-04"),
+    "two days": (["2026-03-04"] * 27 + ["2026-03-05"], None),
+    "read in two ways": (["03/04/2026"] * 28, None),
+}
+
+
+@pytest.mark.parametrize(("cells", "day"), DAYS.values(), ids=DAYS)
+def test_a_column_dates_a_run_whose_rows_share_a_day(lab, cells, day):
+    """Expected: the day as written, in a run file, in a folder of them, and in a Parquet table of two tools."""
+    run = {"date": cells, **short_run(1)}
+    path = write_csv(lab / "run.csv", run, 'serial = "A-1"')
+    assert alone(path, *FIT)["tool"].get("date") == day
+    _, table, ran = calibrated(lab)
+    assert by_serial(table, "A-1")["tool"].get("date") == day
+    assert "'date'" not in ran.err
+    tools = {"serial": ["A-1"] * 28 + ["B-2"] * 28, "date": [*cells, *["2026-05-06"] * 28]}
+    both = {n: np.concatenate([v, short_run(2)[n]]) for n, v in short_run(1).items()}
+    whole = lab.parent / "whole.parquet"
+    pq.write_table(pa.table({**tools, **both}), whole)
+    _, table, _ = calibrated(whole)
+    assert by_serial(table, "A-1")["tool"].get("date") == day
+    assert by_serial(table, "B-2")["tool"]["date"] == "2026-05-06"
+    path = write_csv(lab / "both.csv", {**tools, **both})
+    assert alone(path, *FIT, "--serial", "B-2")["tool"]["date"] == "2026-05-06"
+    assert library.read_run(run, "servo").metadata.get("date") == day
+
+
 OPTIONS = {
     "orders": ("--order", "auto", "--nonlinearity", "none", "--robust", "huber", "--ignore", "dip"),
     "datasheet": (*FIT, "--prior", "datasheet"),

@@ -182,11 +182,13 @@ def test_angles_are_those_of_the_first_reading_or_the_mean_of_an_encoder():
     known, angles = read(run).known, ("inclination", "azimuth", "toolface")
     for name in angles:
         assert read(run | blank).known[name] == pytest.approx(known[name], abs=1e-12)
-    shown = np.tile([359.99, 0.01, 0.0, 359.98, 0.02], COUNT)
     azimuth = np.asarray(run["ref_azimuth_deg"])
-    got = read(run | {"ref_azimuth_deg": (azimuth + shown) % 360.0}).known["azimuth"]
-    turned = (got - known["azimuth"] + np.pi) % (2 * np.pi) - np.pi
-    assert turned == pytest.approx(0.0, abs=1e-9)
+    assert 0.0 in azimuth
+    for shown in ([-0.01, 0.01, 0.0, -0.02, 0.02], [-0.01, 0.03, 0.03, 0.04, 0.01]):
+        turned = (azimuth + np.tile(shown, COUNT)) % 360.0
+        got = read(run | {"ref_azimuth_deg": turned}).known["azimuth"]
+        off = (got - known["azimuth"] + np.pi) % (2 * np.pi) - np.pi
+        assert off == pytest.approx(np.radians(np.mean(shown)), abs=1e-9)
 
 
 def test_what_moves_under_one_label_is_no_station_of_many_readings():

@@ -393,6 +393,19 @@ def test_a_reference_in_the_log_goes_with_its_station():
     assert "unused-columns" in finding_ids(found)
 
 
+@pytest.mark.parametrize("name", ["ref_azimuth_deg", "ref_toolface_deg"])
+@pytest.mark.parametrize("cut", [0.0, -180.0])
+def test_an_encoder_that_flickers_about_the_cut_of_its_circle_is_read_there(name, cut):
+    """Expected: the setting; the median of n readings is uncertain by 1.25 sigma over the root of n."""
+    log, starts, *_ = tumble(8)
+    shown = np.random.default_rng(2).normal(cut, 0.05, log.count)
+    found = find_stations(without(log, **{name: (shown - cut) % 360.0 + cut}))
+    table = found.table.columns
+    off = (table[name] - cut + 180.0) % 360.0 - 180.0
+    assert len(off) == len(starts)
+    assert np.all(np.abs(off) <= 4 * 1.2533 * 0.05 / np.sqrt(table["samples"]))
+
+
 # The command
 
 

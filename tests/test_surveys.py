@@ -1450,6 +1450,15 @@ def test_a_declination_by_row_turns_each_row_by_its_own(example, tmp_path):
     assert np.sqrt(stated**2 - rest**2) == pytest.approx(north, rel=0.01)
 
 
+def test_declinations_by_row_about_180_degrees_have_a_mean_there(example, tmp_path):
+    """Expected: the direction of the sum of unit vectors at the declinations."""
+    cells = np.where(np.arange(36) % 3 == 0, 179.7, -179.9)
+    rows = {"ref_declination_deg": [repr(value) for value in cells.tolist()]}
+    _, document = surveyed_file(example, tmp_path, rows, *BY_CALIBRATION)
+    mean = np.degrees(np.angle(np.exp(1j * np.radians(cells)).sum()))
+    assert document["declination_deg"] == pytest.approx(mean, abs=1e-5)
+
+
 def test_a_declination_by_row_is_whole_or_has_one_that_stands_for_it(example, tmp_path):
     cells = ["2.4"] * 35 + [""]
     given = {**read_csv(EXAMPLE / "well.csv"), "ref_declination_deg": cells}

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mwdcal.geometry import observables as ob
+from mwdcal.geometry.circle import means, unrolled
 from mwdcal.geometry.vectors import (
     are_positive,
     centred,
@@ -190,3 +191,21 @@ def test_lengths_and_products_have_the_digits_of_numpy(shape):
     first, second = rng.normal(size=(2, *shape)) * 10.0 ** rng.integers(-9, 9, (2, *shape))
     np.testing.assert_array_equal(length(first), np.linalg.norm(first, axis=-1))
     np.testing.assert_array_equal(dot(first, second), np.sum(first * second, -1))
+
+
+@pytest.mark.parametrize("cut", [0.0, -180.0])
+@pytest.mark.parametrize("centre", [0.0, 90.0, 180.0, 359.99])
+def test_means_and_medians_of_angles_do_not_depend_on_the_cut_of_the_circle(centre, cut):
+    """Expected: of the same angles about zero; and the direction of the sum of unit vectors, to second order."""
+    about = np.random.default_rng(3).normal(0.0, 0.05, (40, 7))
+    angles = (centre + about - cut) % 360.0 + cut
+    found = means(angles.ravel(), 360.0, np.arange(40) * 7)
+    assert found.min() >= cut
+    assert found.max() <= cut + 360.0
+    np.testing.assert_allclose(
+        centred(found - centre, 360.0), about.mean(-1), rtol=0, atol=1e-12 * 360
+    )
+    vectors = np.degrees(np.angle(np.exp(1j * np.radians(angles)).sum(-1)))
+    np.testing.assert_allclose(centred(found - vectors, 360.0), 0.0, atol=1e-6)
+    medians = np.array([np.median(unrolled(each)) for each in angles])
+    np.testing.assert_allclose(centred(medians - centre, 360.0), np.median(about, -1), atol=1e-9)

@@ -86,6 +86,13 @@ REFERENCES = {
     "field": Reference("ref_field_nt", Range(0, 200_000, "nT", True), Range(0, 200_000, "nT"), 1.0),
     "dip": _angle("dip", -90.0, 90.0),
 }
+
+
+def is_angle(column: str) -> bool:
+    """Whether a column has angles of the stand or of the field."""
+    return column.startswith("ref_") and column.endswith("_deg")
+
+
 TEMPERATURE = Range(-273.15, 1000.0, "°C")
 RAW_RANGE = Range(-1e15, 1e15, "")
 RAW_SPREAD = Range(0.0, 1e15, "")
@@ -100,6 +107,8 @@ RANGES = {
 }
 """The columns of numbers, and their accepted values."""
 COLUMNS = ("station", "group", *RANGES)
+COLUMN_OF_DAY = frozenset({"date"})
+"""The column, and the metadata key, of the day of a run."""
 REFERENCE_VECTORS = tuple(f"ref_{name}_{'g' if name[0] == 'a' else 'nt'}" for name in RAW)
 """Components along the tool axes of gravity and field as the stand states them, instead of angles and strengths."""
 MAPPED = (*COLUMNS, "serial", *REFERENCE_VECTORS)

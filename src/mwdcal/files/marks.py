@@ -95,6 +95,7 @@ _OF_STATUS = re.compile(
     r"(status|state|flag|flags|quality|qual|qc|qa|check|result|bewertung|qualitat|kvalitet|estado|calidad|qualidade|"
     r"statut|etat|статус|качество|оценка|状态|质量|判定|结果)\W*(flag|code)?\W*"
 )
+_OF_JUDGEMENT = (_OF_ACCEPTANCE, _OF_REJECTION, _OF_STATUS)
 """Names of columns whose values judge rows, one by one."""
 _AFFIRMED = {"y", "yes", "true", "1", "x", "ja", "j", "si", "s", "sim", "oui", "o", "да", "д", "是"}
 _DENIED = {"n", "no", "false", "0", "nein", "nei", "nao", "non", "нет", "н", "否"}
@@ -136,7 +137,10 @@ def marks_in(table: Table, form: TableFormat, used: Collection[str]) -> Marks:
     for name in table.columns:
         chosen, kept = ({*map(_plain, each.get(name, ()))} for each in (form.leave_out, form.keep))
         judged = name not in used and name not in form.ignore and not name.startswith("witsml ")
-        judged = judged and (_holds_words(table.columns[name]) or _names_judgements(_plain(name)))
+        judged = judged and (
+            _holds_words(table.columns[name])
+            or any(each.fullmatch(_plain(name)) for each in _OF_JUDGEMENT)
+        )
         checks = {*check_rows(table, name)} if judged else set[int]()
         judged = judged and checks == {*marked_rows(table, name)}
         cells = labels(table, name) if chosen or kept or judged else []
@@ -288,10 +292,6 @@ def _meaning(cell: str, lines: Collection[str]) -> str:
 def _holds_words(column: Column) -> bool:
     """Whether a column has a cell with more than the signs of numbers."""
     return isinstance(column, list) and not set("".join(column)) <= _MARK_NUMBERS
-
-
-def _names_judgements(name: str) -> bool:
-    return any(each.fullmatch(name) for each in (_OF_ACCEPTANCE, _OF_REJECTION, _OF_STATUS))
 
 
 def _copies(table: Table) -> dict[int, str]:

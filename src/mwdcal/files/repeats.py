@@ -17,11 +17,12 @@ import numpy as np
 from mwdcal.calibration.readings import SOAK_GAP
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.files import synonyms
-from mwdcal.files.contract import CHANNELS, RAW, REFERENCES
+from mwdcal.files.contract import CHANNELS, RAW, REFERENCES, is_angle
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, labels, numbers
 from mwdcal.files.statements import rows_of
-from mwdcal.geometry.vectors import Array, Bools, Ints
+from mwdcal.geometry import circle
+from mwdcal.geometry.vectors import Array, Bools, Ints, centred
 from mwdcal.sensor.profile import ColumnSource
 
 _ONE_SETTING = 0.05
@@ -192,7 +193,7 @@ def _equal(values: np.ndarray) -> Bools:
 
 def _set_anew(angles: Mapping[str, Array]) -> Bools:
     """Whether an angle of a row but the first is another than before; a blank one is not."""
-    turned = [np.abs((np.diff(each) + 180.0) % 360.0 - 180.0) for each in angles.values()]
+    turned = [np.abs(centred(np.diff(each), circle.WHOLE_TURN)) for each in angles.values()]
     return np.any([each > _ONE_SETTING for each in turned], 0) if turned else np.array(False)
 
 
@@ -322,8 +323,7 @@ def _mean_column(
     if column in RAW or not column.startswith("ref_"):
         return _means(values, starts)
     first = np.repeat(values[starts], sizes)
-    above = np.where(np.isnan(values), first, values) - first
-    if column.endswith("_deg"):
-        turn = 360.0 / _factor(sources, column)
-        above = (above + turn / 2) % turn - turn / 2
-    return np.asarray(values[starts] + _means(above, starts))
+    filled = np.where(np.isnan(values), first, values)
+    if is_angle(column):
+        return circle.means(filled, circle.WHOLE_TURN / _factor(sources, column), starts)
+    return np.asarray(values[starts] + _means(filled - first, starts))

@@ -31,6 +31,7 @@ from mwdcal.files import synonyms
 from mwdcal.files.contract import (
     AZIMUTH_KEYS,
     CHANNELS,
+    COLUMN_OF_DAY,
     COLUMNS,
     RANGES,
     RAW,
@@ -638,7 +639,9 @@ def to_readings(
         source=table.source,
         sheet=table.sheet,
         run_sha256=table.digest,
-        unused=synonyms.unused(list(table.columns), COLUMNS),
+        unused=synonyms.unused(
+            list(table.columns), {*COLUMNS, *COLUMN_OF_DAY.intersection(table.metadata)}
+        ),
         remarks=table.remarks,
         not_taken={c: line for c, line in table.not_taken.items() if c not in table.columns},
     )

@@ -10,6 +10,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import shown
 from mwdcal.files.formats.table import Table, labels
+from mwdcal.files.formats.titles import dated
 
 
 @dataclass(frozen=True)
@@ -74,11 +75,12 @@ def stated_table(table: Table, statements: Mapping[str, str], column: str = "ser
 
 
 def rows_of(table: Table, rows: list[int]) -> Table:
-    """Some rows of a table."""
+    """Some rows of a table, dated by the day that they share."""
     columns = {
         name: [cells[row] for row in rows] if isinstance(cells, list) else cells[rows]
         for name, cells in table.columns.items()
     }
     lines = [table.lines[row] for row in rows] if len(table.lines) else table.lines
     parts = [table.parts[row] for row in rows] if table.parts else table.parts
-    return replace(table, columns=columns, lines=lines, parts=parts)
+    metadata = dated(table.metadata, columns.items())
+    return replace(table, columns=columns, metadata=metadata, lines=lines, parts=parts)

@@ -18,10 +18,11 @@ from mwdcal.calibration.diagnosis.flags import Alone
 from mwdcal.calibration.readings import TRIADS, Readings, group_numbers
 from mwdcal.errors import InputError, MwdcalError
 from mwdcal.estimation.batch import held_once
-from mwdcal.files.contract import COLUMNS, RANGES, faults
+from mwdcal.files.contract import COLUMN_OF_DAY, COLUMNS, RANGES, faults
 from mwdcal.files.formats import parquet
 from mwdcal.files.formats.columns import as_text, shown
 from mwdcal.files.formats.table import Table
+from mwdcal.files.formats.titles import dated
 from mwdcal.files.runs import convert, to_readings
 from mwdcal.fleet import sources
 from mwdcal.fleet.choices import alike
@@ -101,12 +102,12 @@ class Rows:
         if run := self._run(tool, str(serial)):
             return to_readings(run, self.profile)
         lines = (part.column("#row").to_numpy() + 1).tolist()
-        names = [name for name in part.column_names if name in COLUMNS]
+        names = [name for name in part.column_names if name in (*COLUMNS, *COLUMN_OF_DAY)]
         columns = {name: parquet.as_column(name, part.column(name), arrow) for name in names}
         place = self.source if self.source.endswith(".parquet") else f"{self.source}/*.parquet"
         source = f"serial {serial} of {place}"
         metadata = {**self.metadata, SERIAL: str(serial), **self._north(tool, source)}
-        table = Table(columns, metadata, source, lines, self.digest)
+        table = Table(columns, dated(metadata, columns.items()), source, lines, self.digest)
         return to_readings(table, self.profile, proved=proved)
 
     def _run(self, tool: int, serial: str) -> Table | None:

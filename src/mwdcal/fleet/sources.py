@@ -26,6 +26,7 @@ from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.atomic import visible_files
 from mwdcal.files.formats.columns import LABELS, check_names, shown
 from mwdcal.files.formats.table import SUFFIXES, Table, check_file, labels
+from mwdcal.files.statements import rows_of
 from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import Profile
 
@@ -84,7 +85,7 @@ def run_of(table: Table, serial: str) -> Table:
     cells = labels(table, SERIAL)
     if len(set(filter(None, cells))) > 1:
         rows = [row for row, cell in enumerate(cells) if cell == serial]
-        table = _rows(table, rows, f"{SERIAL} {serial} of {table.source}")
+        table = replace(rows_of(table, rows), source=f"{SERIAL} {serial} of {table.source}")
     runs.check_run(table)
     return replace(table, metadata={**table.metadata, SERIAL: _stated(table) or serial})
 
@@ -93,16 +94,6 @@ def _stated(table: Table) -> str:
     """The serial in the metadata of a table, or empty."""
     stated = table.metadata.get(SERIAL)
     return "" if stated is None or not str(stated).strip() else str(stated)
-
-
-def _rows(table: Table, rows: Sequence[int], source: str) -> Table:
-    """Some rows of a table."""
-    columns = {
-        name: [cells[row] for row in rows] if isinstance(cells, list) else cells[list(rows)]
-        for name, cells in table.columns.items()
-    }
-    lines = [table.lines[row] for row in rows]
-    return replace(table, columns=columns, source=source, lines=lines)
 
 
 def numbers(table: Table, name: str) -> Array:
@@ -183,7 +174,7 @@ class FleetTable:
     @property
     def used(self) -> tuple[str, ...]:
         """The columns that a run has, and the serial."""
-        known = (*contract.COLUMNS, SERIAL, OFFSET, RUN_FILE, FAULT)
+        known = (*contract.COLUMNS, *contract.COLUMN_OF_DAY, SERIAL, OFFSET, RUN_FILE, FAULT)
         return tuple(name for name in self.columns if name in known)
 
     @property

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.errors import InputError, reason
-from mwdcal.files.contract import RANGES
+from mwdcal.files.contract import COLUMN_OF_DAY, RANGES
 from mwdcal.files.formats import atomic, parquet
 from mwdcal.files.formats.columns import LABELS
 from mwdcal.files.formats.table import labels
@@ -40,7 +40,7 @@ from mwdcal.fleet.sources import (
 from mwdcal.geometry.vectors import Ints
 from mwdcal.sensor.profile import Profile
 
-TEXTS = (*LABELS, RUN_FILE, FAULT)
+TEXTS = (*LABELS, *COLUMN_OF_DAY, RUN_FILE, FAULT)
 """Columns of text."""
 TOOL = "#tool"
 """Column of dealt rows: number of the tool, in order of first appearance."""

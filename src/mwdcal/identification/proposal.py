@@ -69,6 +69,7 @@ from mwdcal.files.runs import (
 )
 from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, OURS, WARMTH
+from mwdcal.geometry.circle import resultant
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
 from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside
@@ -824,7 +825,7 @@ def _has_twin(table: Table, answer: str, names: Collection[str]) -> bool:
 
 def _alike(angles: Array) -> float:
     """Length of the mean direction of angles in degrees: 1 where all are one."""
-    return float(abs(np.nanmean(np.exp(1j * np.radians(angles)))))
+    return float(abs(resultant(np.radians(angles[np.isfinite(angles)]))))
 
 
 def _is_of_readings(answer: Answer, question: QuestionError) -> bool:

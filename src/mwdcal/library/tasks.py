@@ -26,6 +26,7 @@ from mwdcal.files import metadata as meta
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, as_text
 from mwdcal.files.formats.table import Table
+from mwdcal.files.formats.titles import dated
 from mwdcal.files.limits import load_limits
 from mwdcal.geometry.vectors import AnyArray, Array
 from mwdcal.library.answers import Said, by_column
@@ -85,8 +86,8 @@ def read_run(
     calibration: `read_run("survey.csv", calibration.profile)`.
 
     `metadata` are those of the run, such as `serial`, `date` and `simulated`, beside those of a file or of the
-    `attrs` of a pandas table: a table in memory has none of the lines above a file's table. `serial` and
-    `simulated` may also be columns.
+    `attrs` of a pandas table: a table in memory has none of the lines above a file's table. `serial`,
+    `simulated` and `date` may also be columns.
 
     Raises:
         InputError: a file that cannot be read, or a cell that is missing or out of range.
@@ -132,7 +133,7 @@ def table_in_memory(source: Any, name: str) -> Table:
                 f"{name}: column '{key}' has {len(column)} values; the longest has {count}. Give one "
                 "value for each row, blank or NaN where unknown."
             )
-    metadata = meta.plain(getattr(source, "attrs", {}), name)
+    metadata = dated(meta.plain(getattr(source, "attrs", {}), name), columns.items())
     units = _units_below(columns)
     if units:
         columns = {key: column[1:] for key, column in columns.items()}

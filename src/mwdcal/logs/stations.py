@@ -15,11 +15,12 @@ import numpy as np
 from mwdcal.calibration.diagnosis.findings import unused_columns
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import InputError
-from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE, Range
+from mwdcal.files.contract import CHANNELS, RAW, TEMPERATURE, Range, is_angle
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table, numbers
 from mwdcal.files.logs import READ, TIME, Say, StoredColumns, silent
 from mwdcal.files.synonyms import unused
+from mwdcal.geometry.circle import unrolled
 from mwdcal.geometry.vectors import Array, Ints
 from mwdcal.logs import standstill
 from mwdcal.logs.regular import SECONDS, check_argument, row_times, unlikely_seconds
@@ -440,8 +441,9 @@ def _columns(
         " ".join(n for n in rows if rows[n].drifts[i]) for i in range(len(start))
     ]
     for name in (n for n in log.columns if n.startswith(("ref_", "sd_ref_")) and n in READ):
-        value = numbers(log, name)
-        columns[name] = np.array([_middle(value[a:b]) for a, b in zip(first, last, strict=True)])
+        value, turns = numbers(log, name), is_angle(name)
+        rests = zip(first, last, strict=True)
+        columns[name] = np.array([_middle(value[a:b], turns) for a, b in rests])
     return columns
 
 
@@ -484,7 +486,10 @@ def _warmth_of(time: Array, value: Array, start: Array, end: Array, lag: float) 
     return warmth
 
 
-def _middle(value: Array) -> float:
-    """The middle one of the cells that are filled in, NaN if none is."""
-    there = np.sort(value[~np.isnan(value)])
-    return float(there[(len(there) - 1) // 2]) if there.size else np.nan
+def _middle(value: Array, turns: bool) -> float:
+    """The middle one of the cells that are filled in, NaN if none is; of angles, which turn, on their circle."""
+    there = value[~np.isnan(value)]
+    if not there.size:
+        return np.nan
+    order = np.argsort(unrolled(there) if turns else there, kind="stable")
+    return float(there[order[(len(there) - 1) // 2]])

@@ -27,6 +27,7 @@ from mwdcal.estimation.problem import ANGLES
 from mwdcal.estimation.uncertainty import Free
 from mwdcal.files.formats.columns import Column
 from mwdcal.files.formats.table import Table
+from mwdcal.geometry.circle import resultant
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_fit
@@ -345,7 +346,7 @@ def _through(
 def _centred(value: Array, name: str) -> Array:
     """Values (..., n) about their middle."""
     periodic = OBSERVABLES[name].period
-    middle = np.angle(np.mean(np.exp(1j * value), -1)) if periodic else value.mean(-1)
+    middle = np.angle(resultant(value)) if periodic else value.mean(-1)
     return OBSERVABLES[name].difference(value, middle[..., None])
 
 

@@ -43,6 +43,7 @@ from mwdcal.files.formats.columns import looks_numeric, shown
 from mwdcal.files.formats.table import Table, cell_error, numbers
 from mwdcal.files.profiles import setting
 from mwdcal.files.runs import away_from_stand, renamed, to_readings
+from mwdcal.geometry.circle import means
 from mwdcal.geometry.units import LENGTH_UNITS
 from mwdcal.geometry.vectors import AnyArray, Array, Bools
 from mwdcal.sensor.profile import StandProfile
@@ -203,9 +204,11 @@ def by_row(table: Table) -> dict[str, Array]:
 
 def typical_north(rows: Mapping[str, Array]) -> dict[str, float]:
     """The declination of a table that varies by row, and its 1σ, as metadata state one for all: their means."""
-    keys = zip(("declination_deg", SD_KEY), DECLINATIONS[:2], strict=True)
-    known = {key: rows[name] for key, name in keys if name in rows and DECLINATIONS[0] in rows}
-    return {k: float(np.nanmean(v)) for k, v in known.items() if not np.isnan(v).all()}
+    if DECLINATIONS[0] not in rows:
+        return {}
+    typical = {"declination_deg": means(rows[DECLINATIONS[0]]).item()}
+    sd = rows.get(DECLINATIONS[1], np.full(1, np.nan))
+    return typical if np.isnan(sd).all() else {**typical, SD_KEY: float(np.nanmean(sd))}
 
 
 def judged_constants(calibration: Calibration, readings: Readings) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from mwdcal.calibration.record import FREE_SHARE, MAGNETIC, Calibration
 from mwdcal.calibration.residuals import tail
 from mwdcal.errors import InputError
 from mwdcal.estimation.problem import ANGLES
+from mwdcal.geometry.circle import resultant
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse
 
@@ -1010,7 +1011,7 @@ class RollTest:
         """Values (k,) of a set about their middle; of toolface its errors."""
         part = (self._error(name) if name == "toolface" else self.value(name))[index]
         periodic = OBSERVABLES[name].period
-        middle = np.angle(np.mean(np.exp(1j * part))) if periodic else part.mean()
+        middle = np.angle(resultant(part)) if periodic else part.mean()
         return OBSERVABLES[name].difference(part, middle)
 
     def _free_spread(self, name: str, index: Ints) -> bool:

@@ -47,6 +47,7 @@ from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.problem import WALKS
 from mwdcal.estimation.solvers import LOSSES, Status
 from mwdcal.estimation.uncertainty import free_directions, station_misfit
+from mwdcal.geometry.circle import resultant
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import Array, Bools, length
 from mwdcal.sensor.models import Basis, Factors, Polynomial, Whole, restricted
@@ -623,7 +624,7 @@ def _alike(readings: Readings) -> dict[str, str]:
         known = readings.reference(name)
         by_stand = bool(~np.isnan(known).any())
         angles = known if by_stand else OBSERVABLES[name].value(*raw)
-        mean = np.mean(np.exp(1j * angles))
+        mean = resultant(angles)
         if abs(mean) > ONE_ANGLE[not by_stand]:
             degrees = np.degrees(np.angle(mean)) % 360
             same[name] = f"{degrees:.4g}°" if by_stand else f"about {degrees:.0f}°"

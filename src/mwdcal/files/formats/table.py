@@ -142,11 +142,7 @@ def parsed(
         arguments = {"form": export, "serial": serial}
     decimal = export.decimal if export else decimal
     parts: Parts = form.parse(data, name, **arguments)
-    metadata = {**block.metadata, **parts.metadata}
-    if export:
-        metadata = dated(
-            metadata, ((n, c) for n, c in parts.columns.items() if isinstance(c, list))
-        )
+    metadata = dated({**block.metadata, **parts.metadata}, parts.columns.items())
     letters = map(letters_of, range(len(parts.columns))) if suffix == ".xlsx" else ()
     places = dict(zip(parts.columns, letters, strict=False))
     return Table(

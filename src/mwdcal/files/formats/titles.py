@@ -8,7 +8,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import NamedTuple
 
-from mwdcal.files.formats.columns import as_text, without_marks
+import numpy as np
+
+from mwdcal.files.formats.columns import LABELS, as_text, looks_numeric, without_marks
+from mwdcal.geometry.vectors import Array
 
 UNITS_BY_SIGN = {
     "°": "deg",
@@ -360,24 +363,24 @@ def day_of(text: str, day_first: bool = False) -> str:
 
 
 def dated(
-    metadata: Mapping[str, object], columns: Iterable[tuple[str, Sequence[str]]]
+    metadata: Mapping[str, object], columns: Iterable[tuple[str, Sequence[str] | Array]]
 ) -> dict[str, object]:
-    """Metadata with the day of a column of times, where they have no date."""
+    """Metadata with the one day of all cells of a column of dates or times, where they have no date."""
     if "date" in metadata:
         return dict(metadata)
-    day = next(filter(None, (_day_of_cells(name, cells) for name, cells in columns)), "")
-    return {**metadata, "date": day} if day else dict(metadata)
-
-
-def _day_of_cells(name: str, cells: Sequence[str]) -> str:
-    """The one day of all cells of a column of times; empty if there is no day, or there are several days."""
-    day = ""
-    for cell in filter(None, cells):
-        each = day_of(cell, not _ENGLISH_DATE.match(name))
-        if not each or (day and each != day):
-            return ""
-        day = each
-    return day
+    for name, cells in columns:
+        if name in LABELS or isinstance(cells, np.ndarray):
+            continue
+        day, first = "", not _ENGLISH_DATE.match(name)
+        for cell in dict.fromkeys(filter(None, cells)):
+            each = "" if looks_numeric(cell) else day_of(cell, first)
+            if not each or (day and each != day):
+                day = ""
+                break
+            day = each
+        if day:
+            return {**metadata, "date": day}
+    return dict(metadata)
 
 
 _MEANT = {_word(word): key for key, words in _TITLE_WORDS.items() for word in words.split()}
