@@ -20,7 +20,7 @@ import numpy as np
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.estimation.problem import ANGLES
-from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints
+from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints, centred
 from mwdcal.sensor.profile import Profile
 
 TRIADS = ("accelerometer", "magnetometer")
@@ -39,6 +39,12 @@ RELATIVE = "relative (field = 1)"
 """Unit of the calibrated field where its strength is known at no station."""
 SOAK_GAP = 5.0
 """Temperatures closer than this belong to one soak, °C."""
+ONE_SETTING = float(np.radians(0.05))
+"""Radians by which the encoder of a stand shows one setting differently at most."""
+EQUAL = 1e-6
+"""References closer than this differ by rounding alone, radians."""
+_BLANK = 10.0
+"""Takes the place of a blank angle where stations are compared."""
 RAMP_PARTS = 6
 """A ramp is judged in parts of about this share of the run's span: enough for every order and one more to test it."""
 LEAST_TEMPERATURE_SPAN = 10.0
@@ -411,6 +417,46 @@ def soaks(temperature: Array) -> Ints:
     numbers = np.empty(order.shape, int)
     np.put_along_axis(numbers, order, np.cumsum(new, -1) - 1, -1)
     return numbers
+
+
+def direction_numbers(inclination: Array, azimuth: Array) -> Ints:
+    """Number (..., n) of the reference direction of each station of a run; a blank angle equals a blank one.
+
+    Definition: both angles of the stations of a direction, in order of size, follow each other by at most
+    `ONE_SETTING`, as an encoder shows one setting, and lie within that of their middle. Where
+    they go further, as on a ramp, only stations of equal angles are of one direction.
+    """
+    angles = np.broadcast_arrays(inclination, azimuth)
+    cells = [
+        np.nan_to_num(x, nan=_BLANK).ravel()
+        for x in (angles[0], np.cos(angles[1]), np.sin(angles[1]))
+    ]
+    run = np.arange(angles[0].size) // max(angles[0].shape[-1], 1)
+    near, equal = [_linked(run, cells, most) for most in (ONE_SETTING, EQUAL)]
+    first = np.unique(near, return_index=True)[1]
+    wide = np.zeros(len(first), bool)
+    for angle in [np.nan_to_num(x).ravel() for x in angles]:
+        away, least, most = centred(angle - angle[first][near]), *np.zeros((2, len(first)))
+        np.minimum.at(least, near, away)
+        np.maximum.at(most, near, away)
+        wide |= most - least > 2 * ONE_SETTING
+    runs = (-1, angles[0].shape[-1])
+    near, equal, far = near.reshape(runs), equal.reshape(runs), wide[near].reshape(runs)
+    near, equal = [x - x.min(-1, keepdims=True, initial=x.size) for x in (near, equal)]
+    return np.asarray(np.where(far, runs[1] + equal, near).reshape(angles[0].shape))
+
+
+def _linked(number: Ints, cells: Sequence[Array], most: float) -> Ints:
+    """Numbers (n,) of stations of one `number` that no gap of more than `most` parts, in order of any cells (n,)."""
+    count = -1
+    while number.max(initial=0) != count:
+        count = number.max(initial=0)
+        for each in cells:
+            order = np.lexsort((each, number))
+            new = (np.diff(number[order]) != 0) | (np.diff(each[order]) > most)
+            number = np.zeros(len(order), int)
+            number[order[1:]] = np.cumsum(new)
+    return number
 
 
 def usable_soaks(temperature: Array) -> Ints:

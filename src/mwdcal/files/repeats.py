@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.calibration.readings import SOAK_GAP
+from mwdcal.calibration.readings import ONE_SETTING, SOAK_GAP
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.files import synonyms
 from mwdcal.files.contract import CHANNELS, RAW, REFERENCES
@@ -24,8 +24,6 @@ from mwdcal.files.statements import rows_of
 from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.sensor.profile import ColumnSource
 
-_ONE_SETTING = 0.05
-"""Degrees by which an encoder of the stand shows one setting differently at most."""
 _ONE_READING = 0.03
 """Share of a triad's range by which readings of one station depart from their mean at most."""
 _OF_ANOTHER_TOOL, _SURE = 0.002, 8.0
@@ -193,7 +191,11 @@ def _equal(values: np.ndarray) -> Bools:
 def _set_anew(angles: Mapping[str, Array]) -> Bools:
     """Whether an angle of a row but the first is another than before; a blank one is not."""
     turned = [np.abs((np.diff(each) + 180.0) % 360.0 - 180.0) for each in angles.values()]
-    return np.any([each > _ONE_SETTING for each in turned], 0) if turned else np.array(False)
+    return (
+        np.any([each > np.degrees(ONE_SETTING) for each in turned], 0)
+        if turned
+        else np.array(False)
+    )
 
 
 def _starts(same: Bools) -> Ints:
