@@ -10,10 +10,11 @@ import numpy as np
 
 from mwdcal.calibration.fit_options import FIT_OPTIONS, FitArguments, Prior, names, order_of
 from mwdcal.calibration.prior import DATASHEET, PriorInformation
-from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings, direction_numbers
+from mwdcal.calibration.readings import HIGHEST, ONE_SETTING, TRIADS, Readings, direction_numbers
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
-from mwdcal.geometry.vectors import Array, Ints
+from mwdcal.geometry.vectors import Array, Ints, centred
+from mwdcal.sensor.profile import PRACTICES
 
 # --------------------------------------------------------------------------
 # Settings of the stand: which stations share one, because the operator set the direction once and rolled the tool.
@@ -28,6 +29,15 @@ ASSUMED = (
     '"per-direction" or "per-station".'
 )
 """The assumption where nobody states the practice of the stand…"""
+ALMOST_ONE = 10 * ONE_SETTING
+"""References closer than this to those of the station before may be meant as one direction, radians."""
+FEW_APART = 2
+"""As many of these occur by chance."""
+UNSHARED = (
+    "{count} stations count as settings of their own, although the profile says that the direction is set once: their "
+    "references differ from those of the station before by less than 0.5°, but by more than an encoder shows one "
+    'setting differently (0.05°). Give one reference for each direction, or state settings = "per-station".'
+)
 ASSUMED_PRACTICE = "assumed"
 """…and what a calibration says of it."""
 
@@ -41,7 +51,8 @@ def settings_of(readings: Readings) -> Ints:
     new setting. Stations without either angle have a setting of their own.
     """
     group = np.broadcast_to(readings.groups, readings.accelerometer.shape[:-1])
-    return numbered(group, [readings.reference(name) for name in DIRECTION], readings.settings)
+    angles = readings.reference("inclination"), readings.reference("azimuth")
+    return numbered(group, angles, readings.settings)
 
 
 def numbered(group: Ints, angles: Sequence[Array], practice: str) -> Ints:
@@ -61,6 +72,17 @@ def numbered(group: Ints, angles: Sequence[Array], practice: str) -> Ints:
     equal = (direction[side] == direction[other]) & (group[side] == group[other])
     earliest = np.argmax(equal, -1)
     return np.where((group >= 0) & given, np.take_along_axis(number, earliest, -1), number)
+
+
+def unshared(readings: Readings) -> Ints:
+    """Count (...) of stations almost in the direction before that share no setting although the practice is stated."""
+    if readings.settings != PRACTICES[0]:
+        return np.zeros(readings.accelerometer.shape[:-2], int)
+    lean, turn = readings.reference("inclination"), readings.reference("azimuth")
+    steps = np.abs(centred(np.diff(lean))), np.abs(centred(np.diff(turn)))
+    almost = np.fmax(*steps) < ALMOST_ONE
+    count = np.sum(almost & (np.diff(settings_of(readings)) != 0), -1)
+    return np.asarray(count * (count > FEW_APART))
 
 
 def is_assumed(readings: Readings) -> bool:

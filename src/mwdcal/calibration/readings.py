@@ -426,31 +426,29 @@ def direction_numbers(inclination: Array, azimuth: Array) -> Ints:
     `ONE_SETTING`, as an encoder shows one setting, and lie within that of their middle. Where
     they go further, as on a ramp, only stations of equal angles are of one direction.
     """
-    angles = np.broadcast_arrays(inclination, azimuth)
-    cells = [
-        np.nan_to_num(x, nan=_BLANK).ravel()
-        for x in (angles[0], np.cos(angles[1]), np.sin(angles[1]))
-    ]
-    run = np.arange(angles[0].size) // max(angles[0].shape[-1], 1)
-    near, equal = [_linked(run, cells, most) for most in (ONE_SETTING, EQUAL)]
-    first = np.unique(near, return_index=True)[1]
-    wide = np.zeros(len(first), bool)
-    for angle in [np.nan_to_num(x).ravel() for x in angles]:
-        away, least, most = centred(angle - angle[first][near]), *np.zeros((2, len(first)))
-        np.minimum.at(least, near, away)
-        np.maximum.at(most, near, away)
-        wide |= most - least > 2 * ONE_SETTING
-    runs = (-1, angles[0].shape[-1])
-    near, equal, far = near.reshape(runs), equal.reshape(runs), wide[near].reshape(runs)
-    near, equal = [x - x.min(-1, keepdims=True, initial=x.size) for x in (near, equal)]
-    return np.asarray(np.where(far, runs[1] + equal, near).reshape(angles[0].shape))
+    inclination, azimuth = np.broadcast_arrays(inclination, azimuth)
+    runs = (-1, inclination.shape[-1])
+    known = np.stack([inclination, np.cos(azimuth), np.sin(azimuth)]).reshape(3, -1)
+    known = np.nan_to_num(known, nan=_BLANK)
+    run = np.arange(known.shape[-1]) // max(runs[1], 1)
+    near, equal = _linked(run, known, ONE_SETTING), _linked(run, known, EQUAL)
+    order = np.argsort(near, kind="stable")
+    starts = np.flatnonzero(np.diff(near[order], prepend=-1))
+    angles = np.nan_to_num(np.stack([inclination, azimuth]).reshape(2, -1))
+    away = centred(angles - angles[:, order[starts]][:, near])[:, order]
+    span = np.maximum.reduceat(away, starts, -1) - np.minimum.reduceat(away, starts, -1)
+    wide = np.max(span, 0)[near].reshape(runs) > 2 * ONE_SETTING
+    near, equal = near.reshape(runs), equal.reshape(runs)
+    near = near - near.min(-1, keepdims=True, initial=near.size)
+    equal = equal - equal.min(-1, keepdims=True, initial=near.size) + runs[1]
+    return np.asarray(np.where(wide, equal, near).reshape(inclination.shape))
 
 
-def _linked(number: Ints, cells: Sequence[Array], most: float) -> Ints:
-    """Numbers (n,) of stations of one `number` that no gap of more than `most` parts, in order of any cells (n,)."""
+def _linked(number: Ints, cells: Array, most: float) -> Ints:
+    """Numbers (n,) of stations of one `number` that no gap of more than `most` parts, in order of any cells (k, n)."""
     count = -1
     while number.max(initial=0) != count:
-        count = number.max(initial=0)
+        count = int(number.max(initial=0))
         for each in cells:
             order = np.lexsort((each, number))
             new = (np.diff(number[order]) != 0) | (np.diff(each[order]) > most)

@@ -78,10 +78,10 @@ def _directions(readings: Readings) -> Iterator[tuple[str, Bools, bool, bool]]:
     if not known.any() and (group < 0).all():
         yield "all stations", np.ones(readings.count, bool), True, True
         return
-    number = np.where((group < 0) & known, direction_numbers(inclination, azimuth), -1)
+    direction = np.where((group < 0) & known, direction_numbers(inclination, azimuth), -1)
     sets: dict[tuple[float, float], Bools] = {}
-    for each in np.unique(number[number >= 0]).tolist():
-        members = np.asarray(number == each)
+    for each in np.unique(direction[direction >= 0]):
+        members = np.asarray(direction == each)
         lean, north = (x[members][0] + readback(x[members]).mean() for x in (inclination, azimuth))
         lean, north = np.round(np.degrees([lean, north % (2 * np.pi)]), _ANGLE_DIGITS)
         sets[float(lean), -1.0 if np.isnan(north) else float(north % 360.0)] = members
@@ -813,7 +813,7 @@ class RollTest:
         """
         lacks = self._lacks(name)
         if lacks or not self.sets:
-            return Departures(skipped=lacks or f"no {ROLL_SET} stations of one direction")
+            return Departures(skipped=lacks or f"no {ROLL_SET} stations of one direction, to 0.05°")
         unfit = {s.label: self.unfit(name, s) for s in self.sets}
         fit = [s for s in self.sets if not unfit[s.label]]
         gaps = {s.label: self.loose(s.index) for s in fit}
@@ -1026,7 +1026,7 @@ class RollTest:
         return OBSERVABLES[name].difference(part, middle)
 
     def _readback(self, name: str, roll_set: RollSet, error: bool) -> Array:
-        """Differences (k,) of references within a set that are part of its spread or error; zero where there are none.
+        """Differences (k,) of references within a set that are part of its spread or error, otherwise zero.
 
         A declared set stands still: its spread is that of the values.
         """

@@ -13,7 +13,6 @@ import numpy as np
 
 from mwdcal.calibration.automatic.courses import f_test
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.options import DIRECTION
 from mwdcal.calibration.readings import (
     EARTH_RANGES,
     HIGHEST,
@@ -511,7 +510,8 @@ def _numbered(evidence: Evidence, by: str) -> Ints:
     if by == "setting":
         return evidence.setting
     if by == "direction":
-        return direction_numbers(*(evidence.known_or_zero[name] for name in DIRECTION))
+        known = evidence.known_or_zero
+        return direction_numbers(known["inclination"], known["azimuth"])
     keys = np.round(evidence.known_or_zero["toolface"], 6)
     alike = bool((keys == keys[:1]).all())
     each = [np.unique(key, return_inverse=True)[1] for key in keys[: 1 if alike else None]]
