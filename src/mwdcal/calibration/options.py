@@ -14,7 +14,6 @@ from mwdcal.calibration.readings import HIGHEST, ONE_SETTING, TRIADS, Readings, 
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
 from mwdcal.geometry.vectors import Array, Ints, centred
-from mwdcal.sensor.profile import PRACTICES
 
 # --------------------------------------------------------------------------
 # Settings of the stand: which stations share one, because the operator set the direction once and rolled the tool.
@@ -75,9 +74,7 @@ def numbered(group: Ints, angles: Sequence[Array], practice: str) -> Ints:
 
 
 def unshared(readings: Readings) -> Ints:
-    """Count (...) of stations almost in the direction before that share no setting although the practice is stated."""
-    if readings.settings != PRACTICES[0]:
-        return np.zeros(readings.accelerometer.shape[:-2], int)
+    """Count (...) of stations almost in the direction before that share no setting with it."""
     lean, turn = readings.reference("inclination"), readings.reference("azimuth")
     steps = np.abs(centred(np.diff(lean))), np.abs(centred(np.diff(turn)))
     almost = np.fmax(*steps) < ALMOST_ONE

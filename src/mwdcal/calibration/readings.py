@@ -427,21 +427,21 @@ def direction_numbers(inclination: Array, azimuth: Array) -> Ints:
     they go further, as on a ramp, only stations of equal angles are of one direction.
     """
     inclination, azimuth = np.broadcast_arrays(inclination, azimuth)
-    runs = (-1, inclination.shape[-1])
+    shape, count = inclination.shape, max(inclination.shape[-1], 1)
     known = np.stack([inclination, np.cos(azimuth), np.sin(azimuth)]).reshape(3, -1)
     known = np.nan_to_num(known, nan=_BLANK)
-    run = np.arange(known.shape[-1]) // max(runs[1], 1)
-    near, equal = _linked(run, known, ONE_SETTING), _linked(run, known, EQUAL)
-    order = np.argsort(near, kind="stable")
-    starts = np.flatnonzero(np.diff(near[order], prepend=-1))
+    run = np.arange(known.shape[-1]) // count
+    number = _linked(run, known, ONE_SETTING)
+    order = np.argsort(number, kind="stable")
+    starts = np.flatnonzero(np.diff(number[order], prepend=-1))
     angles = np.nan_to_num(np.stack([inclination, azimuth]).reshape(2, -1))
-    away = centred(angles - angles[:, order[starts]][:, near])[:, order]
+    away = centred(angles - angles[:, order[starts]][:, number])[:, order]
     span = np.maximum.reduceat(away, starts, -1) - np.minimum.reduceat(away, starts, -1)
-    wide = np.max(span, 0)[near].reshape(runs) > 2 * ONE_SETTING
-    near, equal = near.reshape(runs), equal.reshape(runs)
-    near = near - near.min(-1, keepdims=True, initial=near.size)
-    equal = equal - equal.min(-1, keepdims=True, initial=near.size) + runs[1]
-    return np.asarray(np.where(wide, equal, near).reshape(inclination.shape))
+    wide = np.max(span, 0)[number] > 2 * ONE_SETTING
+    if wide.any():
+        number = _linked(2 * number + wide, np.where(wide, known, 0.0), EQUAL)
+    first = np.minimum.reduceat(number, np.arange(0, len(run), count))
+    return np.asarray((number - first[run]).reshape(shape))
 
 
 def _linked(number: Ints, cells: Array, most: float) -> Ints:

@@ -25,6 +25,7 @@ from mwdcal.calibration.record import (
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, eigen
+from mwdcal.sensor.profile import PRACTICES
 from mwdcal.use.correction import UNKNOWN_TEMPERATURE
 from mwdcal.use.roll_test import (
     DEPARTURE_CHANCE,
@@ -530,7 +531,7 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
     exact = bool(readings.exact_angles[STAND_ANGLES_EXACT])
     if exact and STAND_ANGLES_EXACT not in calibration.assumed_exact:
         yield _finding("stand-exact")
-    if count := int(unshared(readings)):
+    if readings.settings == PRACTICES[0] and (count := int(unshared(readings))):
         yield _finding("settings-unshared", count=count)
     if calibration.temperature_c is None:
         yield _finding("no-temperature", tested=f", {tested} °C" if tested else "")

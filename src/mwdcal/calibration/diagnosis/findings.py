@@ -59,6 +59,7 @@ from mwdcal.estimation.uncertainty import (
     station_misfit,
 )
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, quotient
+from mwdcal.sensor.profile import PRACTICES
 
 # --------------------------------------------------------------------------
 # Stations that repeat the readings of an earlier one more closely than noise allows: copies, not measurements.
@@ -402,8 +403,9 @@ def _settings(fitted: FittedRuns) -> Iterator[Flag]:
     """Stations of one direction that were set one by one, and toolfaces that were not."""
     share = fitted.result.problem.evidence.apart
     yield _remark("settings-apart", share > LEAST_SHOWN, share=share)
-    apart = np.broadcast_to(unshared(fitted.readings), (fitted.count,))
-    yield _remark("settings-unshared", apart > 0, count=apart)
+    if fitted.readings.settings == PRACTICES[0]:
+        count = np.broadcast_to(unshared(fitted.readings), (fitted.count,))
+        yield _remark("settings-unshared", count > 0, count=count)
     yield from _toolfaces(fitted.result)
     stated = {name: fitted.readings.uncertainty(name).max(-1) for name in ANGLES}
     if max(sd.max() for sd in stated.values()) > COARSE_STAND:
