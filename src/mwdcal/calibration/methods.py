@@ -81,7 +81,7 @@ def _settings(
 
     Exact references have none.
     """
-    angles = known["inclination"], known["azimuth"]
+    angles = [known[name] for name in DIRECTION]
     uncertain = np.any([sd[name] > 0 for name in DIRECTION], 0)
     if not uncertain.any():
         return np.full(group.shape, -1)

@@ -28,6 +28,8 @@ ASSUMED = (
     '"per-direction" or "per-station".'
 )
 """The assumption where nobody states the practice of the stand…"""
+ASSUMED_PRACTICE = "assumed"
+"""…and what a calibration says of it."""
 ALMOST_ONE = 10 * ONE_SETTING
 """References closer than this to those of the station before may be meant as one direction, radians."""
 FEW_APART = 2
@@ -37,8 +39,6 @@ UNSHARED = (
     "references differ from those of the station before by less than 0.5°, but by more than an encoder shows one "
     'setting differently (0.05°). Give one reference for each direction, or state settings = "per-station".'
 )
-ASSUMED_PRACTICE = "assumed"
-"""…and what a calibration says of it."""
 
 
 def settings_of(readings: Readings) -> Ints:
@@ -50,8 +50,7 @@ def settings_of(readings: Readings) -> Ints:
     new setting. Stations without either angle have a setting of their own.
     """
     group = np.broadcast_to(readings.groups, readings.accelerometer.shape[:-1])
-    angles = readings.reference("inclination"), readings.reference("azimuth")
-    return numbered(group, angles, readings.settings)
+    return numbered(group, [readings.reference(name) for name in DIRECTION], readings.settings)
 
 
 def numbered(group: Ints, angles: Sequence[Array], practice: str) -> Ints:

@@ -430,31 +430,26 @@ def direction_numbers(inclination: Array, azimuth: Array) -> Ints:
     shape, count = inclination.shape, max(inclination.shape[-1], 1)
     known = np.stack([inclination, np.cos(azimuth), np.sin(azimuth)]).reshape(3, -1)
     known = np.nan_to_num(known, nan=_BLANK)
-    run = np.arange(known.shape[-1]) // count
-    number = _linked(run, known, ONE_SETTING)
-    order = np.argsort(number, kind="stable")
-    starts = np.flatnonzero(np.diff(number[order], prepend=-1))
     angles = np.nan_to_num(np.stack([inclination, azimuth]).reshape(2, -1))
-    away = centred(angles - angles[:, order[starts]][:, number])[:, order]
-    span = np.maximum.reduceat(away, starts, -1) - np.minimum.reduceat(away, starts, -1)
-    wide = np.max(span, 0)[number] > 2 * ONE_SETTING
-    if wide.any():
-        number = _linked(2 * number + wide, np.where(wide, known, 0.0), EQUAL)
+    number = run = np.arange(known.shape[-1]) // count
+    for most in (ONE_SETTING, EQUAL):
+        found = -1
+        while found != (found := number.max(initial=0)):
+            for each in known:
+                order = np.lexsort((each, number))
+                new = (np.diff(number[order]) != 0) | (np.diff(each[order]) > most)
+                number = np.zeros(len(order), int)
+                number[order[1:]] = np.cumsum(new)
+        order = np.argsort(number, kind="stable")
+        starts = np.flatnonzero(np.diff(number[order], prepend=-1))
+        away = centred(angles - angles[:, order[starts]][:, number])[:, order]
+        span = np.maximum.reduceat(away, starts, -1) - np.minimum.reduceat(away, starts, -1)
+        wide = np.max(span, 0)[number] > 2 * ONE_SETTING
+        if not wide.any():
+            break
+        number, known = 2 * number + wide, np.where(wide, known, 0.0)
     first = np.minimum.reduceat(number, np.arange(0, len(run), count))
     return np.asarray((number - first[run]).reshape(shape))
-
-
-def _linked(number: Ints, cells: Array, most: float) -> Ints:
-    """Numbers (n,) of stations of one `number` that no gap of more than `most` parts, in order of any cells (k, n)."""
-    count = -1
-    while number.max(initial=0) != count:
-        count = int(number.max(initial=0))
-        for each in cells:
-            order = np.lexsort((each, number))
-            new = (np.diff(number[order]) != 0) | (np.diff(each[order]) > most)
-            number = np.zeros(len(order), int)
-            number[order[1:]] = np.cumsum(new)
-    return number
 
 
 def usable_soaks(temperature: Array) -> Ints:
