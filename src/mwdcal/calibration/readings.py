@@ -433,8 +433,8 @@ def direction_numbers(inclination: Array, azimuth: Array) -> Ints:
     angles = np.nan_to_num(np.stack([inclination, azimuth]).reshape(2, -1))
     number = run = np.arange(known.shape[-1]) // count
     for most in (ONE_SETTING, EQUAL):
-        found = -1
-        while found != (found := number.max(initial=0)):
+        last = -1
+        while last != (last := number.max(initial=0)):
             for each in known:
                 order = np.lexsort((each, number))
                 new = (np.diff(number[order]) != 0) | (np.diff(each[order]) > most)

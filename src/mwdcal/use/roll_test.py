@@ -995,7 +995,7 @@ class RollTest:
         if name in ANGLES and not roll_set.declared and len(set(number.tolist())) > 1:
             same = number[:, None] == number
             if np.trace(same) == same.sum():
-                return ReferenceErrors(sd, None, 0.0, zero)
+                return ReferenceErrors(np.hypot(sd, alone), None, 0.0, zero)
             return ReferenceErrors(alone, same * np.outer(sd, sd), 0.0, zero)
         most = float(sd.max()) if error else 0.0
         whole = most * float(np.sqrt(np.mean((sd / most) ** 2))) if most else 0.0
