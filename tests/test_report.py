@@ -127,6 +127,7 @@ class Outcome:
     settings: str = "assumed"
     findings: list = field(default_factory=list)
     station_rows: list = field(default_factory=list)
+    not_judged: tuple[str, ...] = ()
     left_open: str = ""
 
 
