@@ -267,6 +267,13 @@ def test_gauges_show_value_and_expanded_uncertainty_against_the_limit(whole):
     assert inclination.bound is None
 
 
+def test_an_angle_whose_limit_was_not_judged_does_not_say_that_it_has_none(whole):
+    verdict = Outcome(True, [Row(passed=True)], not_judged=("error of inclination",))
+    inclination, toolface, _ = calibration_page._gauges(whole, verdict, None)
+    assert (inclination.word, inclination.limit) == ("not judged", "")
+    assert (toolface.word, toolface.limit) == ("not tested", "no limit given")
+
+
 def test_a_raw_figure_beyond_its_limit_has_a_gauge_without_uncertainty(whole):
     """Beyond its limit: scatter that is not noise has no U, and 13 times 1σ would hide the decision."""
     row = Row(value=0.73, uncertainty=0.6, limit=0.1, degrees_of_freedom=1.0, judged_raw=True)

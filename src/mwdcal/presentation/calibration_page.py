@@ -7,7 +7,7 @@ extra `report` (jinja2, matplotlib).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -207,9 +207,10 @@ def _gauges(
                 if sd is None
                 else f"± {uncertainty(expanded)}° expected (U, k = {k:.2g})"
             )
-            yield _gauge(
-                name, expected, 0.0, expanded, bounds.get(name), "°", ("open", "not tested")
-            )
+            limit, outcome = bounds.get(name), ("open", "not tested")
+            gauge = _gauge(name, expected, 0.0, expanded, limit, "°", outcome)
+            skipped = verdict and any(n.endswith(f" of {name}") for n in verdict.not_judged)
+            yield replace(gauge, limit="", word="not judged") if skipped else gauge
     yield from (_judged(row) for row in worst if not row.passed and row not in shown)
 
 
