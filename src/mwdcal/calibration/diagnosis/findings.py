@@ -156,7 +156,7 @@ REMARKS = {
     "settings": "readings put the {angle} of {where} {value:+.3g}° from its reference: {size:.1f} σ of a setting of "
     "the stand. Check this reference, or declare a larger σ.",
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
-    'anew at each. If so, state settings = "per-station" in [stand] of the profile.',
+    'anew at each. If so, state settings = "per-station" in {where}.',
     "stand-too-large": "the stated σ of the stand is far larger than its errors in this run: {angles}. Uncertainties "
     "are too large: check it against the certificate.{radians}",
     "toolface-shared": "errors of the stand's toolface agree within each {by} (chance in noise {chance:.0e}), as if it "
@@ -396,7 +396,11 @@ def _axis_noise(fitted: FittedRuns) -> Iterator[Flag]:
 def _settings(fitted: FittedRuns) -> Iterator[Flag]:
     """Stations of one direction that were set one by one, and toolfaces that were not."""
     share = fitted.result.problem.evidence.apart
-    yield _remark("settings-apart", share > LEAST_SHOWN, share=share)
+    places = "mwdcal.readings(…)", "[stand] of the profile"
+    yield _remark(
+        "settings-apart", share > LEAST_SHOWN, share=share,
+        where=lambda place: places[bool(fitted.alone(place)[0].source)],
+    )  # fmt: skip
     yield from _toolfaces(fitted.result)
     stated = {name: fitted.readings.uncertainty(name).max(-1) for name in ANGLES}
     if max(sd.max() for sd in stated.values()) > COARSE_STAND:
