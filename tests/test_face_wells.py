@@ -311,6 +311,23 @@ def test_options_of_surveys_are_those_of_the_command(folder, tmp_path):
     assert without_files(well.to_dict()) == without_files(typed)
 
 
+def test_arrays_are_surveyed_with_the_depths_given():
+    """Courses of 30 m at 60° inclination and 30° azimuth, by the simulated tool: 15 m deeper, 22.5 m north each."""
+    made = mc.calibrate(mc.simulate(tool=4, seed=1))
+    hole = mc.simulate([60], 8, [30], tool=4, seed=2)
+    vectors = (hole.accelerometer, hole.magnetometer)
+    depths = 30.0 * np.arange(8)
+    given = mc.readings(*vectors, temperature=hole.temperature, md_m=depths)
+    np.testing.assert_array_equal(given.columns["md_m"], depths)
+    well = mc.survey(made, given)
+    np.testing.assert_allclose(well.columns["tvd_m"], 15.0 * np.arange(8), atol=0.2)
+    np.testing.assert_allclose(well.columns["north_m"], 22.5 * np.arange(8), atol=0.2)
+    array = mc.survey(made, np.column_stack([*vectors, hole.temperature]))
+    np.testing.assert_allclose(array.columns["azimuth_magnetic_deg"], 30.0, atol=0.2)
+    lacking = next(finding.text for finding in array.findings if finding.id == "no-path")
+    assert "mwdcal.readings(…, md_m=…)" in lacking
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -323,7 +340,7 @@ def test_options_of_surveys_are_those_of_the_command(folder, tmp_path):
         ({"outside": "drop"}, "`outside` must be one of blank, refuse, extrapolate; got 'drop'"),
         ({"limits": "strict"}, "strict"),
         ({"sensor_drift": "owsg"}, "`sensor_drift` goes with `msa`"),
-        ({"readings": 3}, "`readings` must be a file, columns by name, or readings; got int"),
+        ({"readings": 3}, "readings must be an array of the shape (n, 3), (n, 6) or (n, 7)"),
         ({"cal": 3}, "`cal` must be a calibration or its file; got int"),
         ({"cal": "no.json"}, "no.json: cannot be read"),
     ],

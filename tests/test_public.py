@@ -357,6 +357,25 @@ def test_accuracy_of_the_representation_is_the_typical_one(cal):
         assert f"{name} {value:.2g}°" in accuracy
 
 
+def test_the_practice_of_the_stand_is_stated_where_the_readings_are_from(tmp_path):
+    """The simulated stand is set anew at each station of moosavi-12, whose rolls share a direction."""
+    sd = {"inclination_deg": 0.05, "azimuth_deg": 0.05, "toolface_deg": 0.02}
+    tool = mwdcal.load_profile("servo").with_stand(**sd, settings="per-station")
+    run = mwdcal.simulate("moosavi-12", tool, seed=1)
+    mwdcal.save(run, tmp_path / "run.csv", tool)
+    silent = mwdcal.load_profile("servo").with_stand(**sd)
+    vectors = (run.accelerometer, run.magnetometer)
+    made = {
+        "mwdcal.readings(…)": mwdcal.calibrate(mwdcal.readings(*vectors, sd=sd, **run.known)),
+        "[stand] of the profile": mwdcal.calibrate(tmp_path / "run.csv", silent),
+    }
+    for where, cal in made.items():
+        text = next(finding.text for finding in cal.findings if finding.id == "settings-apart")
+        assert f'state settings = "per-station" in {where}.' in text
+    stated = mwdcal.readings(*vectors, sd=sd, settings="per-station", **run.known)
+    assert "settings-apart" not in {finding.id for finding in mwdcal.calibrate(stated).findings}
+
+
 def test_a_run_file_brings_its_profile_along(tmp_path):
     tool, source = EXAMPLE / "tool.toml", EXAMPLE / "run.csv"
     run = mwdcal.read_run(source, tool)

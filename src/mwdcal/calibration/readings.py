@@ -173,6 +173,7 @@ class Readings:
         others: the numbers (..., n) in those of them that have one at every station, by name.
         table: all columns (n,) of the file or table that was read, as they stand there.
         profile: the tool profile by which raw channels became these readings, if there was one.
+        self_scaled: scales that these readings gave themselves, as the profile stated none, by triad.
         in_radians: angles of which `sd` was given in radians.
         run_sha256, profile_sha256: of the files that both come from.
         settings_source: path and SHA-256 of the laboratory's settings that completed the profile.
@@ -200,6 +201,7 @@ class Readings:
     columns: ClassVar[Mapping[str, AnyArray]]
     """The table, or one made of the readings: `library.shown` puts it here."""
     profile: Profile | None = None
+    self_scaled: Mapping[str, float] = field(default_factory=dict)
     in_radians: tuple[str, ...] = ()
     run_sha256: str = ""
     profile_sha256: str = ""

@@ -502,7 +502,8 @@ class TriadCalibration(msgspec.Struct, frozen=True, kw_only=True):
     model "factors": SF, B (temperature powers fastest) and m, field = (I - m)(x / SF - B).
     `misfit_probability` is the chance of a larger s² if noise and stand are as declared; None where
     the noise was estimated. `size` counts the fitted parameters, `rank` the determined ones: in a model of 9 or 6
-    parameters the others stand in the list as zero, without uncertainty.
+    parameters the others stand in the list as zero, without uncertainty. Lists are those of the file:
+    `numpy.asarray(triad.parameters)` is an array, and `Calibration.parameters` that of all triads.
     """
 
     name: str
@@ -559,6 +560,11 @@ class Slopes(NamedTuple):
     def part(self, rows: slice | Bools) -> Slopes:
         """Those of some readings (n,)."""
         return Slopes(self.jacobian[rows], self.noise[rows])
+
+
+READ_AGAIN = "Read them by the calibration's: mwdcal.read_run(…, cal.profile)."
+CALIBRATE_AGAIN = "Calibrate that run again."
+"""What to do about readings in a scale of their own; where the calibration has none."""
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True):
@@ -759,6 +765,18 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         """Whether the calibration has temperature terms."""
         return any(triad.order for triad in self.triads)
 
+    def check_scales(self, readings: Readings) -> None:
+        """Refuse readings that gave themselves another scale than that of the calibration's run."""
+        for triad in self.triads:
+            scale = getattr(self.profile, triad.name).scale
+            given = readings.self_scaled.get(triad.name)
+            if given and not np.isclose(given, scale or 1.0, rtol=1e-9, atol=0.0):
+                of_run = f"{scale:.6g}). {READ_AGAIN}" if scale else f"not kept). {CALIBRATE_AGAIN}"
+                raise InputError(
+                    f"{readings.name}: the tool profile states no {triad.name} scale, and these readings give another "
+                    f"one ({given:.6g}) than the run of the calibration ({of_run}"
+                )
+
     def _temperature(self, readings: Readings) -> Array:
         if readings.temperature is None and self.thermal:
             raise InputError(
@@ -773,6 +791,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
         self, readings: Readings
     ) -> Iterator[tuple[TriadCalibration, Whole, tuple[Array, Array, Array], slice]]:
         """Triads with readings, their models and what these take, and where their vectors lie."""
+        self.check_scales(readings)
         temperature = self._temperature(readings)
         for index, triad in enumerate(self.triads):
             raw, model = getattr(readings, triad.name), triad.functions(self.reference_temperature)

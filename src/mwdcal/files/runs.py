@@ -643,6 +643,11 @@ def to_readings(
             list(table.columns), {*COLUMNS, *COLUMN_OF_DAY.intersection(table.metadata)}
         ),
         remarks=table.remarks,
+        self_scaled={
+            kind: float(np.squeeze(scale))
+            for kind, scale in scales.items()
+            if getattr(profile, kind).scale is None
+        },
         not_taken={c: line for c, line in table.not_taken.items() if c not in table.columns},
     )
     triads = {

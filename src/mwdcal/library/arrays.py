@@ -47,6 +47,7 @@ def readings(
     settings: Literal["", "per-direction", "per-station"] = "",
     station: Sequence[object] | None = None,
     metadata: Mapping[str, object] | None = None,
+    md_m: ArrayLike | None = None,
     **references: Unpack[References],
 ) -> Readings:
     """Readings of one tool from arrays, lists, or columns of a pandas or polars table.
@@ -77,6 +78,7 @@ def readings(
             Blank: not stated, once is assumed.
         station: labels, for messages and tables.
         metadata: `serial` as text, `date` as 2026-01-31, `operator`, …; `simulated` marks data of no real tool.
+        md_m: measured depths, m, which `survey` needs for a well path.
         references: `inclination`, `azimuth`, `toolface`, `gravity`, `field` and `dip`, where known.
 
     Raises:
@@ -108,6 +110,7 @@ def readings(
         station=() if station is None else tuple(_labels("station", station, shape)),
         digest=fingerprints(triads) if len(shape) == 1 else (),
         metadata=meta.plain(metadata or {}, "the readings"),
+        others={} if md_m is None else {"md_m": _broadcast("md_m", md_m, shape)},
     )
 
 

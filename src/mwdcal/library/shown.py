@@ -210,7 +210,7 @@ def _columns(readings: Readings) -> Mapping[str, AnyArray]:
     if readings.table:
         return readings.table
     table = runs.from_readings(readings, readings.profile or NOMINAL)
-    return arrays_of(table)
+    return {**arrays_of(table), **readings.others}
 
 
 def _to_pandas(readings: Readings) -> Any:

@@ -14,6 +14,7 @@ import numpy as np
 from mwdcal.calibration.calibrate import calibrate as fit_and_judge
 from mwdcal.calibration.diagnosis.findings import of_table
 from mwdcal.calibration.options import FitChoices, Options
+from mwdcal.calibration.prior import profile_for
 from mwdcal.calibration.readings import Readings, ReadingsLike, as_readings
 from mwdcal.calibration.record import Calibration, Finding, html_table
 from mwdcal.comparison.compare import Comparison
@@ -193,9 +194,26 @@ def calibrate(
         FitError: the run cannot give a calibration to be trusted; the message says what to add.
         InputError: an option is unknown.
     """
-    run = readings_of(run, "run", profile or NOMINAL)
+    options = with_choices(options, choices)
+    run, stated = _run_with_profile(run, profile, options)
     whole = run if profile is None else replace(run, profile_sha256="")
-    return fit_and_judge(whole, _profile(run, profile), with_choices(options, choices))
+    return fit_and_judge(whole, stated, options)
+
+
+def _run_with_profile(
+    run: RunSource, profile: ProfileSource | None, options: Options | None
+) -> tuple[Readings, Profile]:
+    """The readings of a run, and the profile as given, but with the axes and scales that made these readings."""
+    if not isinstance(run, Readings):
+        stated = NOMINAL if profile is None else _loaded(profile)[0]
+        run = readings_of(run, "run", profile_for(options.prior if options else None, stated))
+    _check_readings(run)
+    stated = _profile(run, profile)
+    triads = {}
+    for name in run.triads:
+        triad, of_run = getattr(stated, name), getattr(run.profile or stated, name)
+        triads[name] = msgspec.structs.replace(triad, axes=of_run.axes, scale=of_run.scale or 1.0)
+    return run, msgspec.structs.replace(stated, **triads)
 
 
 def _loaded(profile: object) -> tuple[Profile, str]:
@@ -303,9 +321,9 @@ def compare(
     `options` and `choices` as of `calibrate`, the same for all methods; their method does not
     count. `progress` is called with a sentence at each step.
     """
-    run = readings_of(run, "run", profile or NOMINAL)
     given = with_choices(options, choices)
-    result = compare_methods(run, _profile(run, profile), given, progress=progress)
+    run, stated = _run_with_profile(run, profile, given)
+    result = compare_methods(run, stated, given, progress=progress)
     return with_inputs(result, run.metadata, run=run.run_sha256, profile=run.profile_sha256)
 
 

@@ -27,7 +27,14 @@ from mwdcal.library.answers import Said as Answered
 from mwdcal.library.answers import by_column
 from mwdcal.library.arrays import nearest
 from mwdcal.library.results import Result, frame
-from mwdcal.library.tasks import Tabular, _check_readings, table_in_memory, table_of
+from mwdcal.library.tasks import (
+    RunSource,
+    Tabular,
+    _is_tabular,
+    readings_of,
+    table_in_memory,
+    table_of,
+)
 from mwdcal.sensor.profile import Profile
 from mwdcal.use.correction import warn_if_blank
 
@@ -468,7 +475,7 @@ def reference(
 
 def survey(
     cal: Calibration | FilePath,
-    readings: Tabular | Readings,
+    readings: RunSource,
     *,
     reference: PlaceReference | EarthReference | FilePath | None = None,
     msa: bool = False,
@@ -476,7 +483,7 @@ def survey(
     limits: FilePath | SurveyLimits = "owsg-mwd",
     sensor_drift: FilePath | None = None,
     error_model: FilePath | ErrorModel = "owsg-mwd",
-    runs: Sequence[tuple[Calibration | FilePath, Tabular | Readings]] = (),
+    runs: Sequence[tuple[Calibration | FilePath, RunSource]] = (),
     registry: FilePath | None = None,
     switch: tuple[float, float] = (3.0, 5.0),
     tie_in: Sequence[float] | None = None,
@@ -497,7 +504,8 @@ def survey(
 
     Args:
         cal: a calibration, or its file; `cals.parquet#SERIAL` and `tools.sqlite#SERIAL` too.
-        readings: a file, columns by name, a table of pandas or polars, or `Readings` (`md_m` among their columns).
+        readings: a file, columns by name, a table of pandas or polars, or `Readings`: those of `read_run` have the
+            depths of their table, those of arrays `mwdcal.readings(…, md_m=…)`. Or an array, as of `calibrate`.
         reference: gravity, field, dip and declination of the place, from `reference` or its file.
         msa: take the interference of the drill string off the magnetometer, by multi-station analysis.
         axial_correction: also correct each survey by itself: columns `azimuth_…_axial_deg`, with a no-go zone.
@@ -649,9 +657,7 @@ def _with_walk(inputs: WellInputs, registry: FilePath | None) -> WellInputs:
     return with_walk(inputs, os.fspath(registry))
 
 
-def _inputs(
-    tool: LoadedCalibration, readings: Tabular | Readings, said: Said, how: Any
-) -> WellInputs:
+def _inputs(tool: LoadedCalibration, readings: RunSource, said: Said, how: Any) -> WellInputs:
     """The inputs of a run: its calibration and its table."""
     from mwdcal.presentation.readings import inputs_of_run
 
@@ -683,20 +689,14 @@ def _earth(reference: object) -> EarthReference | FilePath | None:
     )
 
 
-def _survey_table(
-    readings: Tabular | Readings, calibration: Calibration, said: Said
-) -> SurveyTable:
+def _survey_table(readings: RunSource, calibration: Calibration, said: Said) -> SurveyTable:
     """The table of readings, under its own names."""
     from mwdcal.presentation.readings import read_surveys
 
-    if isinstance(readings, Readings):
-        _check_readings(readings, "readings")
+    if isinstance(readings, Readings) or not _is_tabular(readings):
+        readings = readings_of(readings, "readings", calibration.profile)
+        calibration.check_scales(readings)
         return SurveyTable(_table_of(readings, calibration.profile), calibration)
-    if not isinstance(readings, str | os.PathLike | Mapping) and not hasattr(readings, "columns"):
-        raise InputError(
-            f"`readings` must be a file, columns by name, or readings; got {type(readings).__name__}. Make some by "
-            "mwdcal.read_run(…)."
-        )
     if not isinstance(readings, str | os.PathLike):
         readings = table_in_memory(readings, "the readings")
     return read_surveys(readings, calibration, said)

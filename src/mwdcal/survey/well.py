@@ -350,7 +350,7 @@ WELL_FINDINGS = {
 LACKING_PATH = {
     True: "no station has both a measured depth and a direction with azimuth.",
     False: 'no column has the measured depth. Add it, or name yours by `column` "md_m=NAME" (in feet '
-    "md_ft or md_usft).",
+    "md_ft or md_usft); arrays take mwdcal.readings(…, md_m=…).",
 }
 """Lack that leaves a well without a path, where stations have depths and where none has."""
 OLD_DRIFT = {

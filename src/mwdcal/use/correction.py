@@ -418,7 +418,7 @@ def compiled(
     triads = numbers(calibration)
     unknown = readings.temperature is None and calibration.thermal
     few = np.prod(shape) < (COMPILED_ROWS if least is None else least)
-    if few or triads is None or unknown or not correction_numba.available():
+    if few or readings.self_scaled or triads is None or unknown or not correction_numba.available():
         return None
     zero = calibration.reference_temperature
     warmth = zero if readings.temperature is None else readings.temperature

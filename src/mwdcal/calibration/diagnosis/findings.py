@@ -157,7 +157,7 @@ REMARKS = {
     "settings": "readings put the {angle} of {where} {value:+.3g}° from its reference: {size:.1f} σ of a setting of "
     "the stand. Check this reference, or declare a larger σ.",
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
-    'anew at each. If so, state settings = "per-station" in [stand] of the profile.',
+    'anew at each. If so, state settings = "per-station" in {where}.',
     "settings-unshared": UNSHARED,
     "stand-too-large": "the stated σ of the stand is far larger than its errors in this run: {angles}. Uncertainties "
     "are too large: check it against the certificate.{radians}",
@@ -398,7 +398,11 @@ def _axis_noise(fitted: FittedRuns) -> Iterator[Flag]:
 def _settings(fitted: FittedRuns) -> Iterator[Flag]:
     """Stations of one direction that were set one by one, and toolfaces that were not."""
     share = fitted.result.problem.evidence.apart
-    yield _remark("settings-apart", share > LEAST_SHOWN, share=share)
+    places = "mwdcal.readings(…)", "[stand] of the profile"
+    yield _remark(
+        "settings-apart", share > LEAST_SHOWN, share=share,
+        where=lambda place: places[bool(fitted.alone(place)[0].source)],
+    )  # fmt: skip
     if fitted.readings.settings == PRACTICES[0]:
         count = np.broadcast_to(unshared(fitted.readings), (fitted.count,))
         yield _remark("settings-unshared", count > 0, count=count)
