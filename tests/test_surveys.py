@@ -1539,11 +1539,11 @@ def test_surveys_that_depart_alike_name_the_references(off, spread, shown):
 
 
 def test_a_wrong_field_reference_is_named(tmp_path):
-    """The bundled well with a field reference 3000 nT too small."""
+    """The bundled well with a field reference 1500 nT too small."""
     fit = ("calibrate", EXAMPLE / "run.csv", "--tool", EXAMPLE / "tool.toml")
     assert cli(*fit, "-o", tmp_path / "tool.json").code == 0
     text = (EXAMPLE / "well.csv").read_text("utf-8")
-    wrong = text.replace(",48000.0,", ",45000.0,")
+    wrong = text.replace(",48000.0,", ",46500.0,")
     assert wrong != text
     for words, table in ((True, wrong), (False, text)):
         (tmp_path / "well.csv").write_text(table, "utf-8")
