@@ -117,6 +117,66 @@ def test_accelerometer_bias_of_5_mg_on_x(tmp_path, fitted):
     assert rows["spread of gravity"]["value"] == pytest.approx(7.07e-3, abs=0.6e-3)
 
 
+def readbacks(size):
+    """Reference columns as an encoder shows them, to four decimals: uniform within ± size degrees."""
+    rng = np.random.default_rng(5)
+    names = ("ref_inclination_deg", "ref_azimuth_deg")
+    return {
+        n: lambda r, n=n: np.round(r[n] + rng.uniform(-size, size, len(r[n])), 4) for n in names
+    }
+
+
+@pytest.mark.parametrize("bias_g", [0.0, 5e-3])
+def test_readbacks_of_an_encoder_judge_as_exact_references_do(tmp_path, fitted, bias_g):
+    """A bias of 5 mg across the axis spreads the inclination by 2 · 5 mg · cos 45° = 0.41°."""
+    biased = {"ax": lambda r: r["ax"] + bias_g * SCALE[0]}
+    exact = mwdcal("verify", fitted[0], roll(tmp_path, **biased), "--json")
+    path = roll(tmp_path, name="read.csv", **biased, **readbacks(0.02))
+    read = mwdcal("verify", fitted[0], path, "--json")
+    assert read.code == exact.code == int(bias_g > 0)
+    rows, others = ({row["name"]: row for row in each.json["rows"]} for each in (read, exact))
+    assert rows.keys() == others.keys()
+    assert rows["spread of inclination"]["value"] == pytest.approx(
+        np.degrees(2 * bias_g * np.cos(np.pi / 4)), abs=0.04
+    )
+    for name, row in rows.items():
+        assert row["value"] == pytest.approx(others[name]["value"], abs=3 * row["uncertainty"])
+
+
+def test_a_verdict_names_limits_that_were_not_judged_and_states_no_risk(tmp_path, fitted):
+    """Readbacks too far apart are no roll set: a bias of 5 mg passes the limits on errors alone."""
+    apart = roll(tmp_path, ax=lambda r: r["ax"] + 4e-3 * SCALE[0], **readbacks(0.15))
+    verdict, page = tmp_path / "verdict.json", tmp_path / "page.html"
+    shown = mwdcal("verify", fitted[0], apart, "-o", verdict, "--report", page).out
+    names = "spread of inclination, spread of azimuth, spread of gravity"
+    document = json.loads(verdict.read_text())
+    assert document["not_judged"] == names.split(", ")
+    assert document["risk"] is None
+    assert f"(not judged: {names})" in shown.splitlines()[0]
+    assert "together: not stated, as limits were not judged" in shown
+    assert "3 not judged" in page.read_text()
+    issued = mwdcal("certificate", fitted[0], "--verification", verdict, "-o", tmp_path / "c.json")
+    assert f"(not judged: {names})" in issued.out
+    assert (
+        json.loads((tmp_path / "c.json").read_text())["as_left"]["not_judged"]
+        == document["not_judged"]
+    )
+
+
+def test_no_risk_is_stated_where_one_station_was_disturbed(tmp_path, fitted):
+    """A sound tool fails by one wrong reading: no figure of the readings says how likely that is."""
+
+    def disturbed(run):
+        return run["ax"] + 0.01 * SCALE[0] * (np.arange(len(run["ax"])) == 3)
+
+    verdict = mwdcal("verify", fitted[0], roll(tmp_path, ax=disturbed), "--json")
+    assert verdict.code == 1
+    assert verdict.json["risk"] is None
+    raw = [row for row in verdict.json["rows"] if "raw figure judged" in row["note"]]
+    assert raw
+    assert {row["probability_within"] for row in raw} == {None}
+
+
 def test_magnetometer_bias_of_1500_nt_on_x(tmp_path, fitted):
     """Azimuth moves by 1500 nT over the horizontal 48000·cos 63° nT, times x's part to the east.
 
@@ -268,7 +328,7 @@ def test_a_knocked_tool_that_was_not_rolled_never_exits_with_0(
         run["group"] = ["A"] * len(toolfaces)
     ran = mwdcal("verify", fitted[0], write_csv(tmp_path / "still.csv", run))
     assert ran.code == 1
-    assert ran.out.startswith("FAIL   still.csv")
+    assert ran.out.startswith("FAIL ")
     shown = " ".join(ran.out.split())
     assert shown.count("cannot be passed") == (5 if references else 3)
     assert "Add toolfaces there" in shown

@@ -127,6 +127,7 @@ class Outcome:
     settings: str = "assumed"
     findings: list = field(default_factory=list)
     station_rows: list = field(default_factory=list)
+    not_judged: tuple[str, ...] = ()
     left_open: str = ""
 
 
@@ -264,6 +265,13 @@ def test_gauges_show_value_and_expanded_uncertainty_against_the_limit(whole):
     assert azimuth.span[1] / azimuth.bound == pytest.approx(0.9 + 0.2776, rel=1e-3)
     assert {each.word for each in (inclination, toolface)} == {"not tested"}
     assert inclination.bound is None
+
+
+def test_an_angle_whose_limit_was_not_judged_does_not_say_that_it_has_none(whole):
+    verdict = Outcome(True, [Row(passed=True)], not_judged=("error of inclination",))
+    inclination, toolface, _ = calibration_page._gauges(whole, verdict, None)
+    assert (inclination.word, inclination.limit) == ("not judged", "")
+    assert (toolface.word, toolface.limit) == ("not tested", "no limit given")
 
 
 def test_a_raw_figure_beyond_its_limit_has_a_gauge_without_uncertainty(whole):

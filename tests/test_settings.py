@@ -9,8 +9,8 @@ from scipy.stats import binom
 
 from mwdcal.calibration.diagnosis.refusals import BAD_INPUT, reading_refusals
 from mwdcal.calibration.estimate import fit
-from mwdcal.calibration.options import Options, is_assumed, settings_of
-from mwdcal.calibration.readings import TRIADS
+from mwdcal.calibration.options import Options, is_assumed, settings_of, unshared
+from mwdcal.calibration.readings import TRIADS, direction_numbers
 from mwdcal.errors import InputError
 from mwdcal.estimation.batch import batch_of_one
 from mwdcal.estimation.resetting import _variance
@@ -35,7 +35,10 @@ CASES = {
     "back to a direction": ([5, 45, 5], [0, 0, 0], {}, "abc"),
     "a full turn is none": ([5, 5, 5], [0, 360, -360], {}, "aaa"),
     "rounding": ([5, 5 + 1e-9], [0, 360 - 1e-9], {}, "aa"),
-    "a hundredth of a degree": ([5, 5.01], [0, 0], {}, "ab"),
+    "readbacks of an encoder": ([45.01, 44.97, 45.02, 45.5], [0, 359.98, 0.03, 0], {}, "aaab"),
+    "a tenth of a degree": ([5, 5.1], [0, 0], {}, "ab"),
+    "a ramp": ([5, 5.04, 5.08, 5.12, 5.12], [0] * 5, {}, "abcdd"),
+    "readbacks of a group": ([5, 45, 5.01], [0] * 3, {"group": ["x", "x", "x"]}, "aba"),
     "no azimuth": ([5, 5, 45], [NAN] * 3, {}, "aab"),
     "no direction": ([NAN] * 3, [NAN] * 3, {}, "abc"),
     "a blank between": ([5, NAN, 5], [0, NAN, 0], {}, "abc"),
@@ -147,3 +150,29 @@ def test_one_sound_run_in_a_hundred_is_taken_as_set_apart(declared):
 
 def test_most_runs_that_were_set_apart_are_taken_so():
     assert set_apart("per-station", 60) > 40
+
+
+def test_directions_meet_across_north_and_at_any_size():
+    """A second formula: angles of pairs, joined one by one; runs of a batch apart."""
+    rng = np.random.default_rng(3)
+    middle = np.radians([[45, 0], [45, 180], [45.5, 0], [90, 359.99], [90, 270]])
+    truth = rng.integers(0, 5, (4, 60))
+    lean, turn = np.moveaxis(
+        middle[truth] + np.radians(rng.uniform(-0.03, 0.03, (4, 60, 2))), -1, 0
+    )
+    number = direction_numbers(lean, np.mod(turn, 2 * np.pi))
+    assert number.min() >= 0
+    for each, of in zip(number, truth, strict=True):
+        np.testing.assert_array_equal(each[:, None] == each, of[:, None] == of)
+
+
+@pytest.mark.parametrize(
+    ("inclination", "practice", "count"),
+    [
+        ([45, 45.2, 45.05, 45.3], "per-direction", 3),
+        ([45, 45.02, 45.01, 45.03], "per-direction", 0),
+        ([45, 46, 47, 48], "per-direction", 0),
+    ],
+)
+def test_stations_almost_of_one_direction_that_share_no_setting(inclination, practice, count):
+    assert unshared(run(inclination, [0] * 4, settings=practice)) == count

@@ -10,10 +10,10 @@ import numpy as np
 
 from mwdcal.calibration.fit_options import FIT_OPTIONS, FitArguments, Prior, names, order_of
 from mwdcal.calibration.prior import DATASHEET, PriorInformation
-from mwdcal.calibration.readings import HIGHEST, TRIADS, Readings
+from mwdcal.calibration.readings import HIGHEST, ONE_SETTING, TRIADS, Readings, direction_numbers
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import InputError
-from mwdcal.geometry.vectors import Array, Bools, Ints, centred
+from mwdcal.geometry.vectors import Array, Ints, centred
 
 # --------------------------------------------------------------------------
 # Settings of the stand: which stations share one, because the operator set the direction once and rolled the tool.
@@ -30,16 +30,23 @@ ASSUMED = (
 """The assumption where nobody states the practice of the stand…"""
 ASSUMED_PRACTICE = "assumed"
 """…and what a calibration says of it."""
-EQUAL = 1e-6
-"""References closer than this are one setting, radians: they differ by rounding alone."""
+ALMOST_ONE = 10 * ONE_SETTING
+"""References closer than this to those of the station before may be meant as one direction, radians."""
+FEW_APART = 2
+"""As many of these occur by chance."""
+UNSHARED = (
+    "{count} stations count as settings of their own, although the profile says that the direction is set once: their "
+    "references differ from those of the station before by less than 0.5°, but by more than an encoder shows one "
+    'setting differently (0.05°). Give one reference for each direction, or state settings = "per-station".'
+)
 
 
 def settings_of(readings: Readings) -> Ints:
     """Number (..., n) of the setting of the stand that each station belongs to.
 
-    Definition: stations that follow each other with equal reference inclination and azimuth share a
+    Definition: stations that follow each other with one reference direction (`direction_numbers`) share a
     setting, unless the profile says that the stand is set at every station; so do stations of a
-    group with equal references, wherever they are in the run. Returning to a direction later is a
+    group with one direction, wherever they are in the run. Returning to a direction later is a
     new setting. Stations without either angle have a setting of their own.
     """
     group = np.broadcast_to(readings.groups, readings.accelerometer.shape[:-1])
@@ -48,19 +55,30 @@ def settings_of(readings: Readings) -> Ints:
 
 def numbered(group: Ints, angles: Sequence[Array], practice: str) -> Ints:
     """`settings_of` stations of groups (..., n) and reference inclination and azimuth (..., n), by a practice."""
-    pair = slice(1, None), slice(None, -1)
-    shared = _equal([group[..., k] for k in pair], [[x[..., k] for k in pair] for x in angles])
+    direction, given = direction_numbers(*angles), ~np.all(np.isnan(angles), 0)
+    after, before, side = (..., slice(1, None)), (..., slice(None, -1)), (..., slice(None), None)
+    shared = (
+        (direction[after] == direction[before]) & given[after] & (group[after] == group[before])
+    )
     if practice == "per-station":
-        shared &= group[..., 1:] >= 0
-    first = np.ones((*group.shape[:-1], 1), bool)
+        shared &= group[after] >= 0
+    first = np.ones((*shared.shape[:-1], 1), bool)
     number = np.cumsum(np.concatenate([first, ~shared], -1), -1) - 1
     if (group < 0).all():
         return np.asarray(number)
-    side = (..., slice(None), None), (..., None, slice(None))
-    equal = _equal([group[k] for k in side], [[x[k] for k in side] for x in angles])
+    other = (..., None, slice(None))
+    equal = (direction[side] == direction[other]) & (group[side] == group[other])
     earliest = np.argmax(equal, -1)
-    grouped = (group >= 0) & ~np.all(np.isnan(angles), 0)
-    return np.where(grouped, np.take_along_axis(number, earliest, -1), number)
+    return np.where((group >= 0) & given, np.take_along_axis(number, earliest, -1), number)
+
+
+def unshared(readings: Readings) -> Ints:
+    """Count (...) of stations almost in the direction before that share no setting with it."""
+    lean, turn = readings.reference("inclination"), readings.reference("azimuth")
+    steps = np.abs(centred(np.diff(lean))), np.abs(centred(np.diff(turn)))
+    almost = np.fmax(*steps) < ALMOST_ONE
+    count = np.sum(almost & (np.diff(settings_of(readings)) != 0), -1)
+    return np.asarray(count * (count > FEW_APART))
 
 
 def is_assumed(readings: Readings) -> bool:
@@ -72,17 +90,6 @@ def is_assumed(readings: Readings) -> bool:
     together = (np.diff(number, axis=-1) == 0) & (group[..., 1:] < 0)
     uncertain = any(readings.uncertainty(name).any() for name in DIRECTION)
     return not readings.settings and uncertain and bool(together.any())
-
-
-def _equal(group: Sequence[Ints], angles: Sequence[Sequence[Array]]) -> Bools:
-    """Where two stations are of one group and have the same known reference direction."""
-    first, second = group
-    equal, given = first == second, np.zeros((), bool)
-    for angle, other in angles:
-        blank = np.isnan(angle), np.isnan(other)
-        equal = equal & ((np.abs(centred(angle - other)) < EQUAL) | (blank[0] & blank[1]))
-        given = given | ~(blank[0] | blank[1])
-    return np.asarray(equal & given)
 
 
 MODELS = FIT_OPTIONS["model"].words

@@ -20,7 +20,7 @@ import numpy as np
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.estimation.problem import ANGLES
-from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints
+from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints, centred
 from mwdcal.sensor.profile import Profile
 
 TRIADS = ("accelerometer", "magnetometer")
@@ -39,6 +39,12 @@ RELATIVE = "relative (field = 1)"
 """Unit of the calibrated field where its strength is known at no station."""
 SOAK_GAP = 5.0
 """Temperatures closer than this belong to one soak, °C."""
+ONE_SETTING = float(np.radians(0.05))
+"""Radians by which the encoder of a stand shows one setting differently at most."""
+EQUAL = 1e-6
+"""References closer than this differ by rounding alone, radians."""
+_BLANK = 10.0
+"""Takes the place of a blank angle where stations are compared."""
 RAMP_PARTS = 6
 """A ramp is judged in parts of about this share of the run's span: enough for every order and one more to test it."""
 LEAST_TEMPERATURE_SPAN = 10.0
@@ -411,6 +417,39 @@ def soaks(temperature: Array) -> Ints:
     numbers = np.empty(order.shape, int)
     np.put_along_axis(numbers, order, np.cumsum(new, -1) - 1, -1)
     return numbers
+
+
+def direction_numbers(inclination: Array, azimuth: Array) -> Ints:
+    """Number (..., n) of the reference direction of each station of a run; a blank angle equals a blank one.
+
+    Definition: both angles of the stations of a direction, in order of size, follow each other by at most
+    `ONE_SETTING`, as an encoder shows one setting, and lie within that of their middle. Where
+    they go further, as on a ramp, only stations of equal angles are of one direction.
+    """
+    inclination, azimuth = np.broadcast_arrays(inclination, azimuth)
+    shape, count = inclination.shape, max(inclination.shape[-1], 1)
+    known = np.stack([inclination, np.cos(azimuth), np.sin(azimuth)]).reshape(3, -1)
+    known = np.nan_to_num(known, nan=_BLANK)
+    angles = np.nan_to_num(np.stack([inclination, azimuth]).reshape(2, -1))
+    number = run = np.arange(known.shape[-1]) // count
+    for most in (ONE_SETTING, EQUAL):
+        last = -1
+        while last != (last := number.max(initial=0)):
+            for each in known:
+                order = np.lexsort((each, number))
+                new = (np.diff(number[order]) != 0) | (np.diff(each[order]) > most)
+                number = np.zeros(len(order), int)
+                number[order[1:]] = np.cumsum(new)
+        order = np.argsort(number, kind="stable")
+        starts = np.flatnonzero(np.diff(number[order], prepend=-1))
+        away = centred(angles - angles[:, order[starts]][:, number])[:, order]
+        span = np.maximum.reduceat(away, starts, -1) - np.minimum.reduceat(away, starts, -1)
+        wide = np.max(span, 0)[number] > 2 * ONE_SETTING
+        if not wide.any():
+            break
+        number, known = 2 * number + wide, np.where(wide, known, 0.0)
+    first = np.minimum.reduceat(number, np.arange(0, len(run), count))
+    return np.asarray((number - first[run]).reshape(shape))
 
 
 def usable_soaks(temperature: Array) -> Ints:

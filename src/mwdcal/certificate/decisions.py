@@ -92,8 +92,9 @@ class Rule:
         value, sd, within, passed = row.value, row.uncertainty, None, False
         band, coverage = self.factors(row)
         if value is not None and sd is not None:
-            within = probability_within(value, sd, row.limit, row.two_sided, row.freedom)
             passed = value + band * sd <= row.limit  # as `verify` decides, to the last digit
+            if not row.judged_raw:
+                within = probability_within(value, sd, row.limit, row.two_sided, row.freedom)
         quantity = Quantity(
             id=row.name.replace(" ", "-"),
             name=row.name,
@@ -156,6 +157,8 @@ def conformity(
     decisions = [rule.decision(row) for row in verification.rows]
     passed = all(decision.passed for decision in decisions)
     risk = verification.risk  # of the other verdict, if the laboratory's rule has led to it
+    if any(row.judged_raw for row in verification.rows) or verification.not_judged:
+        risk = None
     if risk is not None and passed != verification.passed:
         risk = 1 - risk
     test = ConformityTest(
@@ -172,6 +175,7 @@ def conformity(
         decisions=decisions,
         findings=verification.findings,
         risk=risk,
+        not_judged=verification.not_judged,
         settings=SETTING_PRACTICES.get(verification.settings, ""),
     )
     unknown = [UNKNOWN_FREEDOM] if freedom is None else []

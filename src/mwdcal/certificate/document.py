@@ -120,7 +120,7 @@ class LimitDecision(msgspec.Struct, frozen=True, kw_only=True):
 
     `acceptance_limit`: what the value must not exceed, the limit less the guard band.
     `probability_within`: that the true value is within the limit, given value and uncertainty; None where
-    the uncertainty is not stated. `risk`: of the wrong decision that was taken, from it.
+    the uncertainty is not stated, or the value is raw. `risk`: of the wrong decision that was taken, from it.
     `degrees_of_freedom` of the uncertainty; None: unlimited, or not stated. `raw`: the value with the noise in it;
     None: not stated, as in documents of earlier versions.
     """
@@ -140,6 +140,7 @@ class ConformityTest(msgspec.Struct, frozen=True, kw_only=True):
     """A roll test as the certificate shows it: as found, or as left.
 
     `risk`: probability that the verdict is wrong, all limits and roll sets together; None: not stated.
+    `not_judged`: names of limits for which the test lacks something.
     `settings`: in words, how often the direction of the stand was set.
     """
 
@@ -156,6 +157,7 @@ class ConformityTest(msgspec.Struct, frozen=True, kw_only=True):
     decisions: list[LimitDecision]
     findings: list[Finding] = []
     risk: float | None = None
+    not_judged: list[str] = []
     settings: str = ""
 
 

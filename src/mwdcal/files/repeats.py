@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.calibration.readings import SOAK_GAP
+from mwdcal.calibration.readings import ONE_SETTING, SOAK_GAP
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.files import synonyms
 from mwdcal.files.contract import CHANNELS, RAW, REFERENCES, is_angle
@@ -25,8 +25,6 @@ from mwdcal.geometry import circle
 from mwdcal.geometry.vectors import Array, Bools, Ints, centred
 from mwdcal.sensor.profile import ColumnSource
 
-_ONE_SETTING = 0.05
-"""Degrees by which an encoder of the stand shows one setting differently at most."""
 _ONE_READING = 0.03
 """Share of a triad's range by which readings of one station depart from their mean at most."""
 _OF_ANOTHER_TOOL, _SURE = 0.002, 8.0
@@ -194,7 +192,8 @@ def _equal(values: np.ndarray) -> Bools:
 def _set_anew(angles: Mapping[str, Array]) -> Bools:
     """Whether an angle of a row but the first is another than before; a blank one is not."""
     turned = [np.abs(centred(np.diff(each), circle.WHOLE_TURN)) for each in angles.values()]
-    return np.any([each > _ONE_SETTING for each in turned], 0) if turned else np.array(False)
+    limit = np.degrees(ONE_SETTING)
+    return np.any([each > limit for each in turned], 0) if turned else np.array(False)
 
 
 def _starts(same: Bools) -> Ints:

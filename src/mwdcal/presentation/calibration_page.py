@@ -7,7 +7,7 @@ extra `report` (jinja2, matplotlib).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +58,7 @@ from mwdcal.presentation.verification import (
     freedom,
     noise_free,
     raw_rule,
+    verdict_risk,
 )
 from mwdcal.sensor.profile import NOMINAL
 from mwdcal.use import plots
@@ -93,7 +94,7 @@ def render(
     and `rolltest` are the names of the calibration and of a roll test in the next commands.
     """
     pages = environment()
-    pages.filters |= {"freedom": freedom, "noise_free": noise_free}
+    pages.filters |= {"freedom": freedom, "noise_free": noise_free, "risk": verdict_risk}
     template = pages.get_template("report.html")
     findings = _findings(calibration, verdict)
     first, left = leading_findings(findings)
@@ -146,13 +147,15 @@ def outcome(calibration: Calibration, verdict: Verdict | None) -> dict[str, str]
         return banner("open" if level == "good" else level, "Not verified", unverified, after)
     missed = [row.name for row in verdict.rows if not row.passed]
     count = plural(len(verdict.rows), "limit")
+    without = f", {len(verdict.not_judged)} not judged" if verdict.not_judged else ""
+    fit = f"Not judged: {', '.join(verdict.not_judged)}. {fit}" if without else fit
     if free := verdict.left_open:
         headline = f"Not verified – nothing wrong was found, {free} left open"
         return banner("attention", "Open", headline, f"Not judged: {', '.join(missed)}. {fit}.")
     if not verdict.passed:
-        headline = f"Verification failed – {len(missed)} of {count} not met"
+        headline = f"Verification failed – {len(missed)} of {count} not met{without}"
         return banner("bad", "Failed", headline, f"Not met: {', '.join(missed)}. {fit}.")
-    return banner(level, word, f"Verification passed – {count} met", fit)
+    return banner(level, word, f"Verification passed – {count} met{without}", fit)
 
 
 def _spherical(calibration: Calibration) -> bool:
@@ -204,9 +207,10 @@ def _gauges(
                 if sd is None
                 else f"± {uncertainty(expanded)}° expected (U, k = {k:.2g})"
             )
-            yield _gauge(
-                name, expected, 0.0, expanded, bounds.get(name), "°", ("open", "not tested")
-            )
+            limit, outcome = bounds.get(name), ("open", "not tested")
+            gauge = _gauge(name, expected, 0.0, expanded, limit, "°", outcome)
+            skipped = verdict and any(n.endswith(f" of {name}") for n in verdict.not_judged)
+            yield replace(gauge, limit="", word="not judged") if skipped else gauge
     yield from (_judged(row) for row in worst if not row.passed and row not in shown)
 
 

@@ -48,7 +48,7 @@ from mwdcal.presentation.numbers import (
 from mwdcal.presentation.numbers import quantity as in_unit
 from mwdcal.presentation.page import environment, picture, require
 from mwdcal.presentation.text import NOT_STATED, chance, escape_controls, one_line, plural, table
-from mwdcal.presentation.verification import RAW_RULE, VERDICT_RISK
+from mwdcal.presentation.verification import RAW_RULE, VERDICT_RISK, outcome_of, risk_text
 from mwdcal.sensor.profile import Person
 from mwdcal.use import plots as plots
 from mwdcal.use.roll_test import RAW_JUDGED
@@ -167,12 +167,12 @@ def heading(certificate: Certificate) -> list[str]:
 
 def _test(test: ConformityTest) -> str:
     """A roll test: verdict, rule, and each decision with its risk."""
-    outcome = "PASS" if test.passed else "FAIL"
+    outcome = outcome_of(test.passed, test.not_judged)
     lines = [
         f"{outcome}   {test.when}   {test.run}   limits {test.limits}",
         f"rule: {test.rule_text}",
         *([test.settings] if test.settings else []),
-        *([f"{VERDICT_RISK}: {chance(test.risk)}"] if test.risk is not None else []),
+        *([f"{VERDICT_RISK}: {risk}"] if (risk := _risk(test)) else []),
     ]
     header = [
         "",
@@ -187,6 +187,11 @@ def _test(test: ConformityTest) -> str:
     ]
     rows = [_decision(decision) for decision in test.decisions]
     return "\n".join(map(one_line, lines)) + "\n\n" + table(rows, header)
+
+
+def _risk(test: ConformityTest) -> str:
+    """The risk of the verdict of a roll test, or why it is not stated."""
+    return risk_text(test.risk, test.not_judged, any(map(_is_raw, test.decisions)))
 
 
 def _decision(decision: LimitDecision) -> list[str]:
@@ -624,7 +629,9 @@ def _outcome(test: ConformityTest) -> TestOutcome:
     headline = f"Pass – {count} met" if test.passed else f"Fail – {len(missed)} of {count} not met"
     if not test.passed and not missed:
         headline = "Fail"
+    headline += f", {len(test.not_judged)} not judged" if test.not_judged else ""
     after = f"Not met: {', '.join(missed)}. " if missed else ""
+    after += f"Not judged: {', '.join(test.not_judged)}. " if test.not_judged else ""
     return TestOutcome(level, test.when, headline, f"{after}Decision rule: {test.rule}.")
 
 
@@ -639,7 +646,7 @@ def _test_facts(tests: Sequence[ConformityTest]) -> TableBlock:
         "Source of the limits": lambda test: test.source,
         "Decision rule": lambda test: test.rule_text or test.rule,
         "Setting of the stand": lambda test: test.settings,
-        "Risk of a wrong verdict": lambda test: "" if test.risk is None else chance(test.risk),
+        "Risk of a wrong verdict": _risk,
         digest: lambda test: test.calibration_sha256,
     }
     rows = {name: [fact(test) for test in tests] for name, fact in facts.items()}

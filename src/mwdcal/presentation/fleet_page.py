@@ -83,6 +83,7 @@ REMARKED = {
     "stand-too-large": "the stated σ of the stand is far larger than its errors",
     "toolface-shared": "errors of the stand's toolface agree as if it had been set less often than at every station",
     "axis-noise": "residuals along one axis are far larger than along another",
+    "settings-unshared": "stations almost of one direction count as settings of their own",
     "settings-apart": "stations of one direction scatter as if the stand had been set anew at each",
     "field-drift": "the field drifted during the run: fit and uncertainty include it",
     "drift": "offsets of the {triad} drifted during the run: fit and uncertainty include it",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from msgspec import UNSET
@@ -48,7 +48,7 @@ def screen(
         rows.append([row.name, raw, value, sd, freedom(row), limit, verdict, row.note])
     if _free_toolface(result):
         rows.append(["toolface", *["–"] * 5, "open", "zero undetermined"])
-    outcome = "PASS" if result.passed else "FAIL"
+    outcome = outcome_of(result.passed, result.not_judged)
     if free := result.left_open:
         outcome += f": nothing wrong was found; the calibration leaves {free} open"
     first = [outcome, result.data, f"{result.stations} stations"]
@@ -62,11 +62,30 @@ def screen(
     ]
     lines += filter(None, [raw_rule(result)])
     lines += [SETTING_PRACTICES[result.settings]] if result.settings in SETTING_PRACTICES else []
-    if result.risk is not None:
-        lines.append(f"{VERDICT_RISK}: {chance(result.risk)}")
+    lines += [f"{VERDICT_RISK}: {risk}"] if (risk := verdict_risk(result)) else []
     header = ["", "raw", "noise-free", "1σ", FREEDOM, "limit", "", "where"]
     blocks = ["\n".join(map(one_line, lines)), table(rows, header, remarks=True), *_sets(result)]
     return "\n\n".join(blocks)
+
+
+def outcome_of(passed: bool, not_judged: Sequence[str]) -> str:
+    """The verdict in a word, with the names of the limits that it does not cover."""
+    without = f" (not judged: {', '.join(not_judged)})" if not_judged else ""
+    return ("PASS" if passed else "FAIL") + without
+
+
+def risk_text(risk: float | None, not_judged: Sequence[str], raw: bool) -> str:
+    """The risk of a verdict, or why it is not stated; empty where a limit cannot be passed. `raw`: one is judged."""
+    if risk is not None:
+        return chance(risk)
+    if not_judged:
+        return f"{NOT_STATED}, as limits were not judged"
+    return f"{NOT_STATED}, as readings are not smooth over toolface" if raw else ""
+
+
+def verdict_risk(result: Verdict) -> str:
+    """The risk of a verdict, or why it is not stated."""
+    return risk_text(result.risk, result.not_judged, bool(raw_rule(result)))
 
 
 def _free_toolface(result: Verdict) -> bool:

@@ -18,21 +18,20 @@ from functools import cache, cached_property
 import numpy as np
 
 from mwdcal.calibration.options import DIRECTION, is_assumed, settings_of
-from mwdcal.calibration.readings import Readings, soaks
+from mwdcal.calibration.readings import Readings, direction_numbers, soaks
 from mwdcal.calibration.record import FREE_SHARE, MAGNETIC, Calibration
 from mwdcal.calibration.residuals import tail
 from mwdcal.errors import InputError
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.geometry.circle import resultant
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
-from mwdcal.geometry.vectors import Array, Bools, Ints, eigen, inverse
+from mwdcal.geometry.vectors import Array, Bools, Ints, centred, eigen, inverse
 
 NEAR_VERTICAL = np.radians(5.0)
 """Nearer to vertical than this azimuth and toolface are not judged."""
 ROLL_SET = 3
 """Fewest stations that make a roll set."""
 _ANGLE_DIGITS = 3
-_BLANK = -1.0
 _ROUNDING = 1e-9
 
 
@@ -52,7 +51,7 @@ class RollSet:
 
 
 def roll_sets(readings: Readings) -> list[RollSet]:
-    """Roll sets of a run: by group, else by equal reference angles, else all stations.
+    """Roll sets of a run: by group, else by reference direction (`direction_numbers`), else all stations.
 
     Stations of different temperatures are never in one set. Equal inclinations without azimuth
     make a set that does not share an azimuth.
@@ -75,17 +74,26 @@ def _directions(readings: Readings) -> Iterator[tuple[str, Bools, bool, bool]]:
     group = readings.groups
     for number in range(int(group.max(initial=-1)) + 1):
         yield f"roll set {number + 1}", np.asarray(group == number), True, True
-    inclination, azimuth = (np.degrees(readings.reference(n)) for n in ("inclination", "azimuth"))
+    inclination, azimuth = (readings.reference(name) for name in DIRECTION)
     known, turned = ~np.isnan(inclination), "magnetic " if readings.north else ""
     if not known.any() and (group < 0).all():
         yield "all stations", np.ones(readings.count, bool), True, True
         return
-    key = np.round(np.stack([inclination, np.nan_to_num(azimuth, nan=_BLANK)], -1), _ANGLE_DIGITS)
-    for pair in np.unique(key[(group < 0) & known], axis=0):
-        given = bool(pair[1] != _BLANK)
-        where = f"{turned}azimuth {pair[1]:g}°" if given else "azimuth not given"
-        members = np.all(key == pair, -1) & (group < 0)
-        yield f"inclination {pair[0]:g}°, {where}", members, False, given
+    direction = np.where((group < 0) & known, direction_numbers(inclination, azimuth), -1)
+    sets: dict[tuple[float, float], Bools] = {}
+    for each in np.unique(direction[direction >= 0]):
+        members = np.asarray(direction == each)
+        lean, north = (x[members][0] + readback(x[members]).mean() for x in (inclination, azimuth))
+        lean, north = np.round(np.degrees([lean, north % (2 * np.pi)]), _ANGLE_DIGITS)
+        sets[float(lean), -1.0 if np.isnan(north) else float(north % 360.0)] = members
+    for (lean, north), members in sorted(sets.items(), key=lambda each: each[0]):
+        where = f"{turned}azimuth {north:g}°" if north >= 0 else "azimuth not given"
+        yield f"inclination {lean:g}°, {where}", members, False, north >= 0
+
+
+def readback(angle: Array) -> Array:
+    """Reference angles (k,) of one setting less the first of them: as far as an encoder shows them differently."""
+    return centred(angle - angle[0])
 
 
 def near_vertical(readings: Readings, inclination: Array) -> Bools:
@@ -806,7 +814,7 @@ class RollTest:
         """
         lacks = self._lacks(name)
         if lacks or not self.sets:
-            return Departures(skipped=lacks or f"no {ROLL_SET} stations of one direction")
+            return Departures(skipped=lacks or f"no {ROLL_SET} stations of one direction, to 0.05°")
         unfit = {s.label: self.unfit(name, s) for s in self.sets}
         fit = [s for s in self.sets if not unfit[s.label]]
         gaps = {s.label: self.loose(s.index) for s in fit}
@@ -829,7 +837,7 @@ class RollTest:
     def _unrolled(self, name: str, roll_set: RollSet) -> Statistic:
         """Spread, with its noise, of a set that was not rolled."""
         index, label = roll_set.index, roll_set.label
-        part = self._centred(name, index)
+        part = self._centred(name, roll_set)
         raw, middle = float(np.ptp(part)), (part.max() + part.min()) / 2
         return Statistic(raw, 0.0, raw, label, index, part - middle, label)
 
@@ -928,11 +936,11 @@ class RollTest:
     def _rolled(self, name: str, roll_set: RollSet, error: bool, doubted: bool = False) -> _Rolled:
         """The values of a rolled set, their curve, and what their errors would be in other tests."""
         index = roll_set.index
-        part = self._error(name)[index] if error else self._centred(name, index)
+        part = self._error(name)[index] if error else self._centred(name, roll_set)
         noise, reference = self._noise(name)[index], self.reference_errors(name, roll_set, error)
         individual, together = reference.individual, reference.together
         if doubted and not roll_set.declared:
-            individual = self.readings.uncertainty(name)[index]
+            individual = np.maximum(individual, self.readings.uncertainty(name)[index])
         sd = np.hypot(noise, individual)
         among = np.zeros(sd.shape) if together is None else np.sqrt(np.diagonal(together))
         sd = np.maximum(sd, LEAST_ALONE * among)
@@ -975,10 +983,12 @@ class RollTest:
         """Standard uncertainties of the references of a set, as a spread or an error has them.
 
         The error of a setting of the stand is common to the stations that share it, and does not average down.
+        Beside it readbacks of one setting err as much as they scatter.
         """
         index = roll_set.index
         sd, number = self.readings.uncertainty(name)[index], self.settings[index]
         zero = float(self._common(name)[index].max()) if error else 0.0
+        alone = np.full(sd.shape, self._readback(name, roll_set, error).std(ddof=1))
         if name in DIRECTION and self._set_unseen(name, index):
             return ReferenceErrors(np.full(sd.shape, self._setting_error(name)), None, 0.0, zero)
         if name == "toolface":
@@ -986,11 +996,11 @@ class RollTest:
         if name in ANGLES and not roll_set.declared and len(set(number.tolist())) > 1:
             same = number[:, None] == number
             if np.trace(same) == same.sum():
-                return ReferenceErrors(sd, None, 0.0, zero)
-            return ReferenceErrors(np.zeros(sd.shape), same * np.outer(sd, sd), 0.0, zero)
+                return ReferenceErrors(np.hypot(sd, alone), None, 0.0, zero)
+            return ReferenceErrors(alone, same * np.outer(sd, sd), 0.0, zero)
         most = float(sd.max()) if error else 0.0
         whole = most * float(np.sqrt(np.mean((sd / most) ** 2))) if most else 0.0
-        return ReferenceErrors(np.zeros(sd.shape), None, whole, zero)
+        return ReferenceErrors(alone, None, whole, zero)
 
     def _set_unseen(self, name: str, index: Ints) -> bool:
         """Whether the stand was set at each of some stations, and the run has not to what angle."""
@@ -1007,12 +1017,23 @@ class RollTest:
         setting = self._reference_draws(name, np.array([first]))[:, 0]
         return reference.setting * setting + reference.zero * draws(f"zero of {name}", 1)[:, 0]
 
-    def _centred(self, name: str, index: Ints) -> Array:
-        """Values (k,) of a set about their middle; of toolface its errors."""
+    def _centred(self, name: str, roll_set: RollSet) -> Array:
+        """Values (k,) of a set about their middle, less what its readbacks differ by; of toolface its errors."""
+        index = roll_set.index
         part = (self._error(name) if name == "toolface" else self.value(name))[index]
+        part = part - self._readback(name, roll_set, False)
         periodic = OBSERVABLES[name].period
         middle = np.angle(resultant(part)) if periodic else part.mean()
         return OBSERVABLES[name].difference(part, middle)
+
+    def _readback(self, name: str, roll_set: RollSet, error: bool) -> Array:
+        """Differences (k,) of references within a set that are part of its spread or error, otherwise zero.
+
+        A declared set stands still: its spread is that of the values.
+        """
+        if name not in DIRECTION or (roll_set.declared and not error):
+            return np.zeros(len(roll_set.index))
+        return np.nan_to_num(readback(self.readings.reference(name)[roll_set.index]))
 
     def _free_spread(self, name: str, index: Ints) -> bool:
         """Whether the spread of a set moves with a direction that no evidence determines."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from mwdcal.calibration.copies import in_fit
 from mwdcal.calibration.diagnosis.identity import doubts, other_tool
-from mwdcal.calibration.options import ASSUMED, is_assumed
+from mwdcal.calibration.options import ASSUMED, UNSHARED, is_assumed, unshared
 from mwdcal.calibration.readings import STAND_ANGLES_EXACT, Readings, stated_day
 from mwdcal.calibration.record import (
     MARGIN,
@@ -27,6 +27,7 @@ from mwdcal.calibration.results import unknown_gravity
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, eigen
+from mwdcal.sensor.profile import PRACTICES
 from mwdcal.use.correction import UNKNOWN_TEMPERATURE
 from mwdcal.use.roll_test import (
     DEPARTURE_CHANCE,
@@ -177,6 +178,7 @@ VERDICT_FINDINGS = {
     "one setting of the stand (then give them one group: it is counted once). The 1σ rests on the {noise} noise.",
     "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
     "error is counted both ways. State [stand] settings in the profile.",
+    "settings-unshared": UNSHARED,
     "not-smooth": "{title}: the readings leave a smooth curve over toolface by far more than their noise. So the raw "
     "figure is judged, nothing is taken off it, and its 1σ rests on that scatter. A station was misread or moved, or "
     "the tool has an error that these toolfaces do not resolve.",
@@ -319,7 +321,8 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     `degrees_of_freedom`: of the triad of the calibration with the fewest. None: a document of an earlier version.
     `risk`: probability that the verdict is wrong, all sets and limits together: that a true value is beyond
-    its limit in a pass, that none is in a fail. None: a limit could not be judged.
+    its limit in a pass, that none is in a fail. None: a limit was not or cannot be judged, or readings are not smooth.
+    `not_judged`: names of limits for which the run lacks something; absent in documents of earlier versions.
     `settings`: how often the stand's direction was set, "per-direction", "per-station", or "assumed" to be once
     per direction; empty where nobody stated it and nothing rests on it.
     """
@@ -337,6 +340,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     station_rows: list[VerifiedStation] = []
     degrees_of_freedom: float | None = None
     risk: float | None = None
+    not_judged: list[str] = []
     settings: str = ""
 
     plot: ClassVar[Any]
@@ -365,6 +369,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     def __repr__(self) -> str:
         failed = ", ".join(row.name for row in self.rows if not row.passed)
         decision = "passed" if self.passed else f"failed ({failed})"
+        decision += f", {len(self.not_judged)} not judged" if self.not_judged else ""
         return f"<Verdict: {decision}, {len(self.rows)} limits of {self.limits}>"
 
     def _repr_html_(self) -> str:
@@ -377,7 +382,8 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
             )
             for row in self.rows
         ]
-        return html_table("Passed" if self.passed else "Failed", [header, *lines])
+        without = f" (not judged: {', '.join(self.not_judged)})" if self.not_judged else ""
+        return html_table(("Passed" if self.passed else "Failed") + without, [header, *lines])
 
 
 RULES = {
@@ -400,7 +406,8 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
     _check_rolled(test)
     outcomes = [(SPREAD_OF + n, n, most, test.spread(n)) for n, most in limits.spread.items()]
     outcomes += [(f"error of {n}", n, most, test.error(n)) for n, most in limits.error.items()]
-    skipped = _skipped({title: outcome.skipped for title, *_, outcome in outcomes})
+    reasons = {title: each.skipped for title, *_, each in outcomes if each.skipped}
+    skipped = _skipped(reasons)
     outcomes = [outcome for outcome in outcomes if not outcome[-1].skipped]
     judged = [_judged(*outcome, limits.rule == "guarded") for outcome in outcomes]
     if not judged:
@@ -429,7 +436,8 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         ],
         station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
         degrees_of_freedom=fewest_degrees_of_freedom(calibration),
-        risk=_risk(judged, passed),
+        risk=None if skipped else _risk(judged, passed),
+        not_judged=list(reasons),
         settings="assumed" if is_assumed(readings) else readings.settings,
     )
 
@@ -505,7 +513,7 @@ def _skipped(reasons: dict[str, str]) -> list[str]:
     names: dict[str, list[str]] = {}
     for name, reason in reasons.items():
         names.setdefault(reason, []).append(name)
-    return [f"{', '.join(names[reason])} ({reason})" for reason in names if reason]
+    return [f"{', '.join(names[reason])} ({reason})" for reason in names]
 
 
 def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
@@ -534,6 +542,8 @@ def _findings(test: RollTest, skipped: Sequence[str]) -> Iterator[Finding]:
     exact = bool(readings.exact_angles[STAND_ANGLES_EXACT])
     if exact and STAND_ANGLES_EXACT not in calibration.assumed_exact:
         yield _finding("stand-exact")
+    if readings.settings == PRACTICES[0] and (count := int(unshared(readings))):
+        yield _finding("settings-unshared", count=count)
     if calibration.temperature_c is None:
         yield _finding("no-temperature", tested=f", {tested} °C" if tested else "")
 
@@ -663,11 +673,12 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
         note=note + _remark(value, 0.0 if worst.rough else sd, limit, passed), raw=most,
         harmonics=_harmonics(worst, factor), sets=sets, degrees_of_freedom=freedom,
     )  # fmt: skip
-    within = probability_within(value, sd, limit, row.two_sided, freedom)
-    row = msgspec.structs.replace(row, probability_within=within)
-    if worst.rough:
+    if worst.rough:  # by a station misread or moved, of which no probability is known
         remarks = (*remarks, "not-smooth")
-    elif sd > WEAK * limit:
+    else:
+        within = probability_within(value, sd, limit, row.two_sided, freedom)
+        row = msgspec.structs.replace(row, probability_within=within)
+    if sd > WEAK * limit and not worst.rough:
         size = f"{sd:.2g}{'' if row.unit == '°' else ' '}{row.unit}"
         findings.append(_finding("weak-test", row=row, size=size))
     if causes := _causes(row, name, worst):

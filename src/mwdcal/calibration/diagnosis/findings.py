@@ -32,7 +32,7 @@ from mwdcal.calibration.diagnosis.plausibility import (
 from mwdcal.calibration.diagnosis.structure import COLUMN, farthest_setting, is_shown, suspected
 from mwdcal.calibration.diagnosis.structure import described as seen_as
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.options import DIRECTION
+from mwdcal.calibration.options import DIRECTION, UNSHARED, unshared
 from mwdcal.calibration.readings import (
     EARTH_GRAVITY,
     EARTH_RANGES,
@@ -60,6 +60,7 @@ from mwdcal.estimation.uncertainty import (
     station_misfit,
 )
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, quotient
+from mwdcal.sensor.profile import PRACTICES
 
 # --------------------------------------------------------------------------
 # Stations that repeat the readings of an earlier one more closely than noise allows: copies, not measurements.
@@ -157,6 +158,7 @@ REMARKS = {
     "the stand. Check this reference, or declare a larger σ.",
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
     'anew at each. If so, state settings = "per-station" in [stand] of the profile.',
+    "settings-unshared": UNSHARED,
     "stand-too-large": "the stated σ of the stand is far larger than its errors in this run: {angles}. Uncertainties "
     "are too large: check it against the certificate.{radians}",
     "toolface-shared": "errors of the stand's toolface agree within each {by} (chance in noise {chance:.0e}), as if it "
@@ -397,6 +399,9 @@ def _settings(fitted: FittedRuns) -> Iterator[Flag]:
     """Stations of one direction that were set one by one, and toolfaces that were not."""
     share = fitted.result.problem.evidence.apart
     yield _remark("settings-apart", share > LEAST_SHOWN, share=share)
+    if fitted.readings.settings == PRACTICES[0]:
+        count = np.broadcast_to(unshared(fitted.readings), (fitted.count,))
+        yield _remark("settings-unshared", count > 0, count=count)
     yield from _toolfaces(fitted.result)
     stated = {name: fitted.readings.uncertainty(name).max(-1) for name in ANGLES}
     if max(sd.max() for sd in stated.values()) > COARSE_STAND:

@@ -13,7 +13,13 @@ import numpy as np
 
 from mwdcal.calibration.automatic.courses import f_test
 from mwdcal.calibration.estimate import Fit
-from mwdcal.calibration.readings import EARTH_RANGES, HIGHEST, TRIADS, Readings
+from mwdcal.calibration.readings import (
+    EARTH_RANGES,
+    HIGHEST,
+    TRIADS,
+    Readings,
+    direction_numbers,
+)
 from mwdcal.calibration.record import Calibration, numbers
 from mwdcal.calibration.residuals import (
     RESHOOT,
@@ -503,11 +509,13 @@ def _numbered(evidence: Evidence, by: str) -> Ints:
     """Number (B, n) of the stations' "setting" of the stand, "direction" or "toolface"; -1 of a station alone."""
     if by == "setting":
         return evidence.setting
-    names = ("inclination", "azimuth") if by == "direction" else ("toolface",)
-    keys = np.stack([np.round(evidence.known_or_zero[name], 6) for name in names], -1)
+    if by == "direction":
+        known = evidence.known_or_zero
+        return direction_numbers(known["inclination"], known["azimuth"])
+    keys = np.round(evidence.known_or_zero["toolface"], 6)
     alike = bool((keys == keys[:1]).all())
-    each = [np.unique(key, axis=0, return_inverse=True)[1] for key in keys[: 1 if alike else None]]
-    return np.broadcast_to(np.reshape(each, (len(each), -1)), keys.shape[:2])
+    each = [np.unique(key, return_inverse=True)[1] for key in keys[: 1 if alike else None]]
+    return np.broadcast_to(each, keys.shape)
 
 
 def robust(result: Fit) -> Bools:

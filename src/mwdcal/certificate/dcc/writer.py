@@ -305,6 +305,8 @@ def _roll_test(test: ConformityTest, simulated: bool) -> ET.Element:
         f"Calibration SHA-256 {test.calibration_sha256}."
     )
     facts += f" {test.settings}" if test.settings else ""
+    if test.not_judged:
+        facts += f" Limits that were not judged: {', '.join(test.not_judged)}."
     if test.risk is not None:
         facts += f" Probability that the verdict is wrong, all limits together: {test.risk:.2g}."
     return typed(
