@@ -400,6 +400,24 @@ def test_positions_that_are_asked_for_and_cannot_be_are_refused(tmp_path, labora
     assert ran.code == 0, ran
 
 
+def test_positions_that_temperatures_leave_out_name_them(tmp_path, laboratory):
+    """The refusal of an option has the cause that the finding without it has."""
+    hot = well_table(Temp=("°C", np.full(len(METRES), 60.0)))
+    survey = (
+        "survey",
+        laboratory[0],
+        text_table(tmp_path / "WELL.csv", hot),
+        "-o",
+        tmp_path / "o.csv",
+    )
+    cause = "36 of 36 rows lie outside the calibrated range"
+    assert cause in cli(*survey).err
+    message = refused(cli(*survey, "--tie-in", "0,0,300"), 2)
+    assert "--tie-in needs a well path" in message
+    assert cause in message
+    assert "--outside extrapolate" in message
+
+
 def test_a_well_without_positions_says_so_first(tmp_path, laboratory):
     """Before surveys that nothing judges, and in the first line of the screen."""
     table = {n: each for n, each in deep("gone", METRES).items() if n != "gone"}

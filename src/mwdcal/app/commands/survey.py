@@ -278,7 +278,9 @@ def _check_positions(
     """Refuse options on positions of a well that has none."""
     from mwdcal.survey.surveying import check_path
 
-    lacking = next((each.text for each in result.well.findings if each.id == "no-path"), "")
+    texts = {each.id: each.text for each in result.well.findings}
+    causes = [texts[each] for each in ("no-path", "outside-temperature") if each in texts]
+    lacking = " ".join(causes) if "no-path" in texts else ""
     options_on_path = {"section_azimuth": section, "covariance": covariance, "listing": listing}
     check_path(lacking, tie_in=tie_in, **options_on_path)
 
