@@ -9,6 +9,8 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
+_ONE_WORD = re.compile(r"[\w./\\:+@=#~…-]+")
+"""A name that no shell takes apart."""
 _MOST_NAMED = 4
 """Answers that a message names."""
 
@@ -31,6 +33,15 @@ class FitError(MwdcalError):
     """The input is understood but not calibratable or not trustworthy (exit code 3)."""
 
     exit_code = 3
+
+
+def file_argument(file: object) -> str:
+    """A file as a command line has it: in double quotes where bash, cmd or PowerShell would take its name apart.
+
+    >>> file_argument("runs/tool.csv"), file_argument("DM-4471 run (2).csv")
+    ('runs/tool.csv', '"DM-4471 run (2).csv"')
+    """
+    return str(file) if _ONE_WORD.fullmatch(str(file)) else f'"{file}"'
 
 
 def argument_of(name: str, text: str) -> str | int:
