@@ -785,7 +785,15 @@ def test_the_screen_says_where_north_east_and_tvd_count_from(example, tmp_path, 
 @pytest.mark.parametrize(
     ("columns", "options", "message"),
     [
-        ({"md_m": [str(1000 - i) for i in range(36)]}, (), "must not decrease"),
+        ({"md_m": [str(1000 - i) for i in range(36)]}, (), "must not decrease.* Sort"),
+        ({"md_m": [*map(str, range(18)), *map(str, range(18))]}, (), "line 21, .*twice.* by --run"),
+        (
+            {"md_m": [*map(str, range(20)), *map(str, range(3, 19))]},
+            (),
+            "line 23, .*twice.* by --run",
+        ),
+        ({"md_m": [*map(str, range(20)), "0", *map(str, range(21, 36))]}, (), "line 23, .* Sort"),
+        ({"md_m": [*map(str, range(35)), "0"]}, (), "line 38, .* Sort"),
         (
             {"md_m": ["7", "8", "7.9", *map(str, range(9, 42))]},
             (),
