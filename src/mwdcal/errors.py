@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
-_ONE_WORD = re.compile(r"[\w./\\:+@=#~…-]+")
-"""A name that no shell takes apart."""
+shell_word = partial(re.compile(r"(?=.*[^\w./\\:+@=#~…-]).+", re.DOTALL).sub, r'"\g<0>"')
+"""Quotes the name of a file as a command line needs it, where bash, cmd or PowerShell would take it apart."""
 _MOST_NAMED = 4
 """Answers that a message names."""
 
@@ -33,15 +34,6 @@ class FitError(MwdcalError):
     """The input is understood but not calibratable or not trustworthy (exit code 3)."""
 
     exit_code = 3
-
-
-def file_argument(file: object) -> str:
-    """A file as a command line has it: in double quotes where bash, cmd or PowerShell would take its name apart.
-
-    >>> file_argument("runs/tool.csv"), file_argument("DM-4471 run (2).csv")
-    ('runs/tool.csv', '"DM-4471 run (2).csv"')
-    """
-    return str(file) if _ONE_WORD.fullmatch(str(file)) else f'"{file}"'
 
 
 def argument_of(name: str, text: str) -> str | int:
@@ -101,12 +93,10 @@ def _said_by(answers: Sequence[str]) -> str:
 
 
 def _quoted(value: str) -> str:
-    """A value as a shell takes it."""
-    return (
-        value
-        if re.fullmatch(r"[\w=.+-]+", value, re.ASCII)
-        else "'" + value.replace("'", "'\\''") + "'"
-    )
+    """A value as a shell takes it; as bash does where no quotes serve all shells."""
+    if {*value} & {*'"$`'}:
+        return "'" + value.replace("'", "'\\''") + "'"
+    return shell_word(value)
 
 
 class QuestionsError(FitError):

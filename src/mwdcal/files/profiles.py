@@ -17,7 +17,7 @@ import msgspec
 
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.digests import sha256_of
-from mwdcal.errors import InputError, file_argument, reason
+from mwdcal.errors import InputError, reason, shell_word
 from mwdcal.files.contract import CHANNELS, MAPPED, TEMPERATURE, units_of
 from mwdcal.files.formats.table import shown
 from mwdcal.files.metadata import LARGEST_TOML, load_toml, toml
@@ -146,7 +146,7 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
         )
     if path.suffix.lower() == _SUFFIX:
         remedy = (
-            f", or make one: mwdcal profile TABLE -o {file_argument(name)}"
+            f", or make one: mwdcal profile TABLE -o {shell_word(name)}"
             if folder == "profiles"
             else ""
         )
@@ -200,7 +200,7 @@ def decoded_profile(data: bytes, source: str) -> Profile:
         if Path(source).suffix.lower() != _SUFFIX:
             raise InputError(
                 f"{source} is no tool profile, which is a TOML file. For a table make one: mwdcal profile "
-                f"{file_argument(source)} -o tool.toml."
+                f"{shell_word(source)} -o tool.toml."
             ) from None
         raise _unreadable(data, error, source) from None
     check_profile(profile, source)

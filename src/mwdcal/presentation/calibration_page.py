@@ -24,7 +24,7 @@ from mwdcal.calibration.results import (
     without_temperature,
 )
 from mwdcal.certificate.decisions import coverage_of, expanded_of
-from mwdcal.errors import InputError, file_argument
+from mwdcal.errors import InputError, shell_word
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.calibration import (
@@ -249,7 +249,7 @@ def _steps(
 ) -> list[str]:
     """Steps after the calibration: stations to measure again, then the next command."""
     count, named = sum(row.reshoot for row in calibration.station_rows), file
-    file, test = map(file_argument, (named, verdict.run if verdict else rolltest))
+    file, test = map(shell_word, (named, verdict.run if verdict else rolltest))
     steps = [f"Measure {plural(count, 'station')} again, and calibrate once more."] if count else []
     if verdict is None:
         return [

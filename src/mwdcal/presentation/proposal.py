@@ -11,7 +11,7 @@ from msgspec.structs import asdict
 
 from mwdcal.calibration.readings import TRIADS, simulated
 from mwdcal.calibration.record import Finding
-from mwdcal.errors import file_argument
+from mwdcal.errors import shell_word
 from mwdcal.files.contract import RANGES
 from mwdcal.files.formats.columns import WORKBOOKS
 from mwdcal.files.formats.layout import Layout
@@ -114,8 +114,10 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
         table(rows, ["triad", "axes", "nominal scale", "variation left", "by the next best axes"])
     )
     if output:
-        table_file, result = file_argument(run), file_argument(output.with_suffix(".json"))
-        command = f"mwdcal calibrate {table_file} --tool {file_argument(output)} -o {result}"
+        table_file, tool, result = map(
+            shell_word, map(str, (run, output, output.with_suffix(".json")))
+        )
+        command = f"mwdcal calibrate {table_file} --tool {tool} -o {result}"
         command += f" --rolltest {table_file}" if has_roll_test else ""
         command += page_option(output.with_suffix(".html"))
         if depths_of_surveys(proposal):

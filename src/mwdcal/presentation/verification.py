@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, SignatureCheck
-from mwdcal.errors import file_argument
+from mwdcal.errors import shell_word
 from mwdcal.presentation.numbers import capital, measured, quantity, unit
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import NOT_STATED, chance, one_line, table
@@ -119,11 +119,11 @@ def after_failure(
 
     Where values failed: each place once, and the fault that it looks like. Else no value could be stated.
     """
-    record = one_line(file_argument(calibration))
+    record = one_line(shell_word(str(calibration)))
     failed = [row for row in result.rows if row.uncertainty is not None and not row.passed]
     places = dict.fromkeys(row.note.partition(";")[0] for row in failed)
     if places:
-        command = f"mwdcal diagnose {record} {one_line(file_argument(run))}"
+        command = f"mwdcal diagnose {record} {one_line(shell_word(str(run)))}"
         again = f"measure again: {'; '.join(places)}"
         if any(finding.id == "harmonic-unseen" for finding in result.findings):
             again += ", at six or more toolfaces, evenly spread"

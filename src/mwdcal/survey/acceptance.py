@@ -30,7 +30,7 @@ from mwdcal.survey.stations import RANDOM, STRENGTHS, SURVEY_OBSERVABLES, Survey
 STRENGTH_NAMES = SURVEY_OBSERVABLES[STRENGTHS]
 LEAST_FREE = 1e-12
 """Share of a variance that is of its quantity alone, at least: the rounding of a correlation."""
-ALIKE = 0.25
+LARGEST_SPREAD = 0.25
 """Departures are alike if their middle half spans less than this share of the median."""
 SURVEY_UNITS = {
     "gravity": ("mg", 1e3, 2),
@@ -197,7 +197,7 @@ class Judgement:
                 np.quantile(off[there], [0.25, 0.5, 0.75]) if there.any() else np.zeros(3)
             )
             beyond = np.mean(np.abs(off[there]) > most[there]) if there.any() else 0.0
-            if beyond > 0.5 and high - low < ALIKE * abs(middle):
+            if beyond > 0.5 and high - low < LARGEST_SPREAD * abs(middle):
                 parts.append(f"{name} by {middle * factor:+.{digits}f} {unit}")
         return parts
 

@@ -310,19 +310,19 @@ def depths(table: Table, length_unit: str = "") -> Array | None:
     back = there[1:][np.diff(md[there]) < 0]
     if back.size:
         known, row = md[there], int(back[0])
-        anew = back.size == 1 and _begin_anew(known[there < row], known[there >= row])
+        anew = back.size == 1 and _start_over(known[there < row], known[there >= row])
         raise not_deeper(table, row, md[row], length_unit, TWO_PARTS if anew else UNSORTED)
     return md if there.size else None
 
 
-def _begin_anew(first: Array, second: Array) -> bool:
-    """Whether depths start once more: in the upper half of the first part, with two stations of the second in it."""
+def _start_over(first: Array, second: Array) -> bool:
+    """Whether depths start over: in the upper half of the first part, with two stations of the second in it."""
     return bool(second[0] <= np.median(first) and second[:2].max() <= first[-1] and second[1:].size)
 
 
 UNSORTED = "Sort the stations by measured depth."
 TWO_PARTS = (
-    "The depths begin anew there: is the table in it twice? Delete the copy. If it is the next run of the well, put "
+    "The depths start over there: is the table in it twice? Delete the copy. If it is the next run of the well, put "
     "its rows into another table, and name that by `run`."
 )
 """What to do about depths that decrease: at any row, or once, where a second table seems to begin."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
-from mwdcal.errors import InputError, file_argument
+from mwdcal.errors import InputError, shell_word
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
@@ -56,7 +56,7 @@ def command(folder: Path, as_json: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     atomic.write_all(zip(files, contents, strict=True))
     names = ("run.csv", "tool.toml", "tool.json")
-    run, tool, result = (file_argument(folder / name) for name in names)
+    run, tool, result = (shell_word(str(folder / name)) for name in names)
     rows = [[str(file), what] for file, what in zip(files, CONTENTS.values(), strict=True)]
     screen = f"{table(rows, [f'wrote, all {SIMULATED}', ''])}\n\n"
     page = page_option(folder / "tool.html")
