@@ -650,6 +650,20 @@ def test_a_wrong_value_of_any_length_stays_short():
     assert len(done.err) < 1_000
 
 
+@pytest.mark.parametrize(
+    ("option", "line"),
+    [("--declination", "# declination_deg = "), ("--declination-deg", "# declination_deg = "),
+     ("--ref-field-nt", "# ref_field_nt = "), ("--dip", "# ref_dip_deg = "), ("--stationn", "")],
+)  # fmt: skip
+def test_an_option_for_what_a_table_states_says_where_it_goes(option, line):
+    done = mwdcal("survey", "tool.json", "well.csv", "-o", "out.csv", option, "2.4")
+    assert done.code == 2
+    assert f"No such option '{option}'" in done.err
+    assert ("a line above the table" in done.err) == bool(line)
+    assert line in done.err
+    assert ("Did you mean '--station'?" in done.err) != bool(line)
+
+
 def test_errors_name_options_as_they_are_typed():
     with pytest.raises(InputError) as refusal:
         failing.main(["run.csv"], standalone_mode=False)

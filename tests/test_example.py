@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -117,6 +118,31 @@ def test_the_next_commands_are_those_of_the_first_page(tmp_path, monkeypatch):
     for command in ("example demo", "profile demo/export.csv -o export.toml"):
         following = mwdcal(*command.split()).out.rpartition("next: ")[2].strip()
         assert following in [line.removeprefix("$ ") for line in lines]
+
+
+def test_the_next_commands_run_with_blanks_in_the_names_of_files(tmp_path, monkeypatch):
+    """As a shell takes them apart, from the example to the verdict."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my stand").mkdir()
+
+    def following(*words):
+        done = mwdcal(*words)
+        assert done.code == 0, done
+        name, *rest = shlex.split(done.out.rpartition("next: ")[2].splitlines()[0])
+        assert name == "mwdcal"
+        return rest
+
+    verify = following(*following("example", "my stand/demo (2)"))
+    assert verify[:2] == ["verify", str(Path("my stand", "demo (2)", "tool.json"))]
+    shutil.copy("my stand/demo (2)/rolltest.csv", "roll test.csv")
+    assert mwdcal("verify", verify[1], "roll test.csv").code == 0
+    shutil.copy("my stand/demo (2)/export.csv", "my export.csv")
+    calibrate = following("profile", "my export.csv", "-o", "my tool.toml")
+    assert calibrate[:4] == ["calibrate", "my export.csv", "--tool", "my tool.toml"]
+    assert following(*calibrate)[:2] == ["verify", "my tool.json"]
+    for tool in ((), ("--tool", "my export.csv")):
+        message = refused(mwdcal("calibrate", "my export.csv", "-o", "x.json", *tool), 2)
+        assert 'mwdcal profile "my export.csv" -o tool.toml' in message
 
 
 def test_a_page_that_shows_another_line_is_noticed():

@@ -154,3 +154,36 @@ def test_an_estimate_that_fails_is_said(monkeypatch):
     assert finding.id == "not-judged"
     assert "could not be judged: Singular" in finding.text
     assert exchanged_axes(tool(2), replace(right, magnetometer=None)) == []
+
+
+def test_exchanged_columns_are_named_beside_a_misfit():
+    """Noise above the calibration's: the right axes do not fit either, and leave a small share of the misfit."""
+    rng, right = np.random.default_rng(3), one(wells(tool(2), DEVIATED, 1, 2))
+    noise = 40.0 * rng.normal(size=right.magnetometer.shape)
+    noisy = replace(right, magnetometer=right.magnetometer + noise)
+    both = {name: getattr(noisy, name) @ XY for name in ("accelerometer", "magnetometer")}
+    assert "fit the calibration with ax = ay, ay = ax, mx" in named(tool(2), replace(noisy, **both))
+    assert not named(tool(2), noisy)
+
+
+@pytest.mark.parametrize("row", [0, 3])
+def test_one_wrong_sign_is_no_exchange(row):
+    right = one(wells(tool(2), DEVIATED, 1, 2))
+    wrong = right.magnetometer.copy()
+    wrong[row, 0] *= -1
+    assert not named(tool(2), replace(right, magnetometer=wrong))
+
+
+def test_surveys_of_another_tool_say_that_alone(tmp_path):
+    """The serial comes first, without a word about a prior; multi-station analysis refuses it."""
+    fit = ("calibrate", EXAMPLE / "run.csv", "--tool", EXAMPLE / "tool.toml")
+    assert mwdcal(*fit, "-o", tmp_path / "tool.json").code == 0
+    survey = ("survey", tmp_path / "tool.json", EXAMPLE / "well.csv", "-o", tmp_path / "out.csv")
+    done = mwdcal(*survey, "--serial", "OTHER")
+    assert done.code == 0
+    assert done.err.startswith("! the readings are of tool OTHER, the calibration of tool ")
+    assert "prior" not in done.err
+    done = mwdcal(*survey, "--serial", "OTHER", "--msa")
+    assert done.code == 2
+    assert "well.csv is of tool OTHER" in done.err
+    assert "prior" not in done.err

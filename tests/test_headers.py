@@ -289,7 +289,7 @@ def test_the_answers_of_a_choice_are_one_call_or_one_command():
     question = QuestionError("Which?", [several, row])
     called = "column=['ax=A x', 'ay=A y'], serial='17' or header_row=7, declination_deg=NUMBER"
     typed = (
-        "--column 'ax=A x' --column 'ay=A y' --serial 17 or --header-row 7 --declination-deg NUMBER"
+        '--column "ax=A x" --column "ay=A y" --serial 17 or --header-row 7 --declination-deg NUMBER'
     )
     assert str(question) == f"Which? Answer by {called}."
     assert question.with_options == f"Which? Answer by {typed}."

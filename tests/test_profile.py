@@ -600,7 +600,7 @@ def test_columns_that_are_not_understood_are_named(tmp_path):
     run = write_csv(tmp_path / "run.csv", renamed(turned, ref_azimuth_deg="Lage 2"))
     message = refused(mwdcal("profile", run, "-o", tmp_path / "tool.toml"), 3)
     assert "no column is 'ref_azimuth_deg' by its name. Is it one of these?" in message
-    assert "--column 'ref_azimuth_deg=Lage 2' or --column ref_azimuth_deg=." in message
+    assert '--column "ref_azimuth_deg=Lage 2" or --column ref_azimuth_deg=.' in message
     answer = ("--column", "ref_azimuth_deg=Lage 2", "--north", "true", "--declination-deg", "8")
     assert mwdcal("profile", run, "-o", tmp_path / "tool.toml", *answer).code == 0
 

@@ -2,6 +2,7 @@
 
 import re
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -552,6 +553,38 @@ def test_references_that_no_limit_judges_and_the_readings_contradict_are_named(
     }
     judged = Limits(name="all", error=Bounds(**{errors[name]: 1.0}))
     assert "contradicted" not in ids(verify(record, wrong, judged))
+
+
+@pytest.mark.parametrize(
+    ("name", "off", "shown"),
+    [("field", 900.0, "field {field:.0f} nT and {other:.0f} nT"), ("field", 150.0, ""),
+     ("dip", 1.0 * DEG, "dip 65.00° and 66.00°"), ("dip", 0.1 * DEG, ""),
+     ("gravity", 1e-3, "gravity 1.0000 g and 1.0010 g"), ("gravity", 4e-4, "")],
+)  # fmt: skip
+def test_references_of_one_day_that_differ_are_named(record, name, off, shown):
+    """Of the calibration's run and the test: by more than a day and rounding change them."""
+    field = record.earth["field"]
+    dated = msgspec.structs.replace(
+        record, tool={**record.tool, "date": "2026-03-14"}, gravity_stated=True, constants=[]
+    )
+    known = {"dip": np.full(12, 65 * DEG), "field": np.full(12, field), "gravity": np.ones(12)}
+    known[name] = known[name] + off
+    test = roll(45, **known, toolface=plan((45,))[2])
+    for day, sd, differs in (
+        ("2026-03-14", {}, bool(shown)),
+        ("2026-03-15", {}, False),
+        ("", {}, False),
+        ("2026-03-14", {name: np.full(12, 2 * off)}, False),
+    ):
+        readings = msgspec_replace(test, metadata={"date": day}, sd={**test.sd, **sd})
+        texts = [
+            each.text
+            for each in verify(dated, readings, BOTH).findings
+            if each.id == "contradicted-by-run"
+        ]
+        assert bool(texts) == differs, (day, sd)
+        if differs:
+            assert f"references: {shown.format(field=field, other=field + off)}. " in texts[0]
 
 
 def several(count, seed, size, record, toolfaces=12, sd=NOISE):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import openpyxl
 import pytest
@@ -171,6 +173,38 @@ def test_readings_in_no_unit_of_the_run_are_refused(tmp_path, laboratory):
     path = workbook(tmp_path / "WELL.xlsx", W=table)
     message = refused(cli("survey", laboratory[0], path, "-o", tmp_path / "well.csv"), 2)
     assert "no place on Earth" in message
+
+
+def test_the_unit_of_a_run_without_one_may_be_stated(tmp_path):
+    """The refusal of surveys in mg and nT says what to write; the run calibrated so reads them."""
+    angles = {ours: (theirs, "deg") for ours, theirs in ANGLES.items()}
+    names = {c: f"{name} raw" for c, name in RUN.items()}
+    run = measured("run.csv", names, ("mg", "nT"), **angles)
+    run = {name: ("" if name in names.values() else u, cells) for name, (u, cells) in run.items()}
+    run |= {"F ref": ("nT", np.full(len(run["Ax raw"][1]), 48_000.0))}
+    path, well = (
+        workbook(tmp_path / "run.xlsx", run=run),
+        workbook(tmp_path / "W.xlsx", W=well_table()),
+    )
+    profile, record = tmp_path / "tool.toml", tmp_path / "tool.json"
+    assert cli("profile", path, "-o", profile).code == 0
+    calibrate = ("calibrate", path, "--tool", profile, "-o", record)
+    survey = ("survey", record, well, "-o", tmp_path / "well.csv")
+    assert cli(*calibrate).code == 0
+    message = refused(cli(*survey), 2)
+    assert "reads in mg and the magnetometer reads in nT in this table, and in raw" in message
+    text = profile.read_text("utf-8")
+    for letter, unit in (("a", "mg"), ("m", "nT")):
+        channels = ", ".join(f"{letter}{axis}" for axis in "xyz")
+        assert f'unit = "{unit}" for {channels}' in message
+        text = re.sub(rf'({letter}[xyz] = .*unit = )"raw"', rf'\1"{unit}"', text)
+    profile.write_text(text, "utf-8")
+    assert cli(*calibrate).code == 0
+    done = cli(*survey)
+    assert done.code == 0
+    assert float(read_csv(tmp_path / "well.csv")["inclination_deg"][-1]) == pytest.approx(
+        70.0, abs=0.1
+    )
 
 
 @pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("(ft)", 0.3048)])
@@ -364,6 +398,24 @@ def test_positions_that_are_asked_for_and_cannot_be_are_refused(tmp_path, labora
     assert not out.exists()
     ran = cli("survey", laboratory[0], path, "-o", out, *option, "--column", "md_m=Strekning")
     assert ran.code == 0, ran
+
+
+def test_positions_that_temperatures_leave_out_name_them(tmp_path, laboratory):
+    """The refusal of an option has the cause that the finding without it has."""
+    hot = well_table(Temp=("°C", np.full(len(METRES), 60.0)))
+    survey = (
+        "survey",
+        laboratory[0],
+        text_table(tmp_path / "WELL.csv", hot),
+        "-o",
+        tmp_path / "o.csv",
+    )
+    cause = "36 of 36 rows lie outside the calibrated range"
+    assert cause in cli(*survey).err
+    message = refused(cli(*survey, "--tie-in", "0,0,300"), 2)
+    assert "--tie-in needs a well path" in message
+    assert cause in message
+    assert "--outside extrapolate" in message
 
 
 def test_a_well_without_positions_says_so_first(tmp_path, laboratory):

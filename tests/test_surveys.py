@@ -785,7 +785,15 @@ def test_the_screen_says_where_north_east_and_tvd_count_from(example, tmp_path, 
 @pytest.mark.parametrize(
     ("columns", "options", "message"),
     [
-        ({"md_m": [str(1000 - i) for i in range(36)]}, (), "must not decrease"),
+        ({"md_m": [str(1000 - i) for i in range(36)]}, (), "must not decrease.* Sort"),
+        ({"md_m": [*map(str, range(18)), *map(str, range(18))]}, (), "line 21, .*twice.* by --run"),
+        (
+            {"md_m": [*map(str, range(20)), *map(str, range(3, 19))]},
+            (),
+            "line 23, .*twice.* by --run",
+        ),
+        ({"md_m": [*map(str, range(20)), "0", *map(str, range(21, 36))]}, (), "line 23, .* Sort"),
+        ({"md_m": [*map(str, range(35)), "0"]}, (), "line 38, .* Sort"),
         (
             {"md_m": ["7", "8", "7.9", *map(str, range(9, 42))]},
             (),
@@ -806,7 +814,7 @@ def test_the_screen_says_where_north_east_and_tvd_count_from(example, tmp_path, 
         ({"accepted": ["x"] * 36}, (), "'accepted' is there already"),
         ({}, ("--switch", "5"), "--switch"),
         ({}, ("--switch", "6,5"), "--switch"),
-        ({}, ("--tie-in", "1,2"), "--tie-in"),
+        ({}, ("--tie-in", "1,2"), "--tie-in must be 3 or 6 numbers"),
         ({}, ("--limits", "nothing"), "nothing"),
         ({}, ("--error-model", "nothing"), "Built in: owsg-mwd"),
         ({}, ("--outside", "hide"), "--outside"),
@@ -1267,7 +1275,7 @@ def test_a_tie_in_has_three_numbers_or_six(example, tmp_path):
     ran = cli(
         "survey", example, EXAMPLE / "well.csv", "-o", tmp_path / "o.csv", "--tie-in", "1,2,3,4"
     )
-    assert "--tie-in must be 6 numbers" in refused(ran, 2)
+    assert "--tie-in must be 3 or 6 numbers" in refused(ran, 2)
 
 
 def test_dogleg_severity_and_vertical_section(example, tmp_path):
@@ -1516,3 +1524,38 @@ def test_the_page_lists_positions_before_the_contributions(example, tmp_path):
     last = read_csv(tmp_path / "n.csv")
     for name in ("north_m", "east_m", "tvd_m"):
         assert f"<td>{float(last[name][-1]):.2f}</td>" in table
+
+
+@pytest.mark.parametrize(
+    ("off", "spread", "shown"),
+    [({"field": 900.0}, 50.0, "alike: field by +900 nT (median)"), ({"field": 900.0}, 900.0, ""),
+     ({"dip": np.radians(-2.0)}, 50.0, "alike: dip by -2.00 ° (median)"), ({}, 50.0, "")],
+)  # fmt: skip
+def test_surveys_that_depart_alike_name_the_references(off, spread, shown):
+    """A strength that departs by one amount everywhere; one that scatters as much is no reference."""
+    rng, count, bound = np.random.default_rng(4), 41, np.array([2e-3, 500.0, np.radians(1.0)])
+    departure = np.zeros((count, 3))
+    for name, size in off.items():
+        departure[:, STRENGTH_NAMES.index(name)] += size
+    around = rng.permutation(np.linspace(-1, 1, count))  # the median departure is exact
+    departure[:, STRENGTH_NAMES.index("field")] += spread * around
+    judgement = Judgement(
+        departure, np.tile(bound, (count, 1)), np.zeros(count), np.full(count, np.inf),
+        (np.abs(departure) <= bound).all(-1),
+    )  # fmt: skip
+    assert [f"alike: {each} (median)" for each in judgement.alike()] == [shown] * bool(shown)
+
+
+def test_a_wrong_field_reference_is_named(tmp_path):
+    """The bundled well with a field reference 1500 nT too small."""
+    fit = ("calibrate", EXAMPLE / "run.csv", "--tool", EXAMPLE / "tool.toml")
+    assert cli(*fit, "-o", tmp_path / "tool.json").code == 0
+    text = (EXAMPLE / "well.csv").read_text("utf-8")
+    wrong = text.replace(",48000.0,", ",46500.0,")
+    assert wrong != text
+    for words, table in ((True, wrong), (False, text)):
+        (tmp_path / "well.csv").write_text(table, "utf-8")
+        done = cli(
+            "survey", tmp_path / "tool.json", tmp_path / "well.csv", "-o", tmp_path / "o.csv"
+        )
+        assert ("most surveys depart alike: field by +" in done.err) == words

@@ -293,7 +293,7 @@ def test_a_further_page_without_a_title_block_is_of_the_run_that_it_numbers_on(
 def test_a_further_page_that_may_be_of_another_run_is_asked_about(tmp_path, sheets, line, numbers):
     path = pages_of(tmp_path / "a.xlsx", sheets, line, numbers=numbers)
     message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
-    assert all(f"--sheet '{name}'" in message or f"--sheet {name}" in message for name in sheets)
+    assert all(f'--sheet "{name}"' in message or f"--sheet {name}" in message for name in sheets)
 
 
 def test_a_further_page_of_verification_is_no_part_of_the_run(tmp_path):
@@ -312,7 +312,7 @@ def test_a_further_page_of_verification_is_no_part_of_the_run(tmp_path):
 def test_sheets_that_may_be_two_runs_are_asked_about(tmp_path, sheets, numbers):
     path = workbook_of(tmp_path / "a.xlsx", table(station=[*numbers]), sheets)
     message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
-    assert all(f"--sheet '{name}'" in message or f"--sheet {name}" in message for name in sheets)
+    assert all(f'--sheet "{name}"' in message or f"--sheet {name}" in message for name in sheets)
 
 
 def test_sheets_whose_names_contradict_their_temperatures_are_asked_about(tmp_path):

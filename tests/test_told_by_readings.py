@@ -378,7 +378,7 @@ def test_an_angle_that_the_readings_fit_far_worse_than_its_twin_is_asked_about(t
     path = written(tmp_path / "a.csv", columns)
     message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
     assert "'TF 2' and 'TF set (deg)' tell one angle" in message
-    assert "--column 'ref_toolface_deg=TF 2' or --column" in message
+    assert '--column "ref_toolface_deg=TF 2" or --column' in message
 
 
 def test_what_the_tool_gives_of_the_dip_is_no_reference(tmp_path):
@@ -461,7 +461,7 @@ def test_a_column_in_a_unit_of_temperatures_is_named_with_the_option_that_takes_
     ran = mwdcal("profile", path, "-o", tmp_path / "t.toml")
     assert ran.code == 0, ran
     for name in names:
-        assert f"--column 'temperature_c={name}'" in ran.err
+        assert f'--column "temperature_c={name}"' in ran.err
     taken = mwdcal(
         "profile", path, "-o", tmp_path / "u.toml", "--column", f"temperature_c={names[0]}"
     )
@@ -481,7 +481,7 @@ def test_a_name_that_messages_cut_or_quote_is_whole_in_the_option_that_takes_it(
     columns[name][0] = np.nan
     columns[name] = ["" if cell != cell else cell for cell in columns[name].tolist()]
     alone = findings_of(library.propose_profile(written(tmp_path / "b.csv", columns)))
-    assert f"'temperature_c={name}'" in alone["temperature-by-unit"]
+    assert f'"temperature_c={name}"' in alone["temperature-by-unit"]
     assert "temperature-by-unit" in said
 
 

@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
+shell_word = partial(re.compile(r"(?=.*[^\w./\\:+@=#~…-]).+", re.DOTALL).sub, r'"\g<0>"')
+"""Quotes the name of a file as a command line needs it, where bash, cmd or PowerShell would take it apart."""
 _MOST_NAMED = 4
 """Answers that a message names."""
 
@@ -90,12 +93,10 @@ def _said_by(answers: Sequence[str]) -> str:
 
 
 def _quoted(value: str) -> str:
-    """A value as a shell takes it."""
-    return (
-        value
-        if re.fullmatch(r"[\w=.+-]+", value, re.ASCII)
-        else "'" + value.replace("'", "'\\''") + "'"
-    )
+    """A value as a shell takes it; as bash does where no quotes serve all shells."""
+    if {*value} & {*'"$`'}:
+        return "'" + value.replace("'", "'\\''") + "'"
+    return shell_word(value)
 
 
 class QuestionsError(FitError):

@@ -62,6 +62,14 @@ SECTIONS = {
 _EXTRA = re.compile(r"Got unexpected extra argument \((.*)\)")
 _EXTRA_FILES = {"--tool": "the tool profile", "--rolltest": "the roll test", "--plan": "a plan"}
 """Options of a file that may be meant where a command takes no more files, and what each is."""
+_OF_TABLES = {
+    "declination": "declination_deg = 2.4",
+    "convergence": "convergence_deg = 0.5",
+    "gravity": "ref_gravity_g = 1.0012",
+    "field": "ref_field_nt = 50460",
+    "dip": "ref_dip_deg = 68.1",
+}
+"""Words of options for what tables state, and the line that does."""
 ALIASES = {
     "help": "mwdcal --help",
     "correct": "mwdcal apply",
@@ -167,8 +175,14 @@ def _nearest(word: str, names: Iterable[str]) -> str:
 
 def _with_nearest(error: click.ClickException) -> click.ClickException:
     """The same error; of a wrong option with the one that is nearest, of a second file with its option."""
-    if isinstance(error, click.NoSuchOption) and error.possibilities:
-        nearest = _nearest(error.option_name, error.possibilities)
+    if isinstance(error, click.NoSuchOption):
+        word = error.option_name.lstrip("-").removeprefix("ref-").partition("-")[0]
+        if word in _OF_TABLES:
+            place = f"State it in a line above the table, such as '# {_OF_TABLES[word]}'"
+            return click.UsageError(
+                f"{error.message} {place}: mwdcal reference gives it.", error.ctx
+            )
+        nearest = _nearest(error.option_name, error.possibilities or [])
         return click.NoSuchOption(error.option_name, None, [nearest] if nearest else [], error.ctx)
     context = error.ctx if isinstance(error, click.UsageError) else None
     extra = _EXTRA.fullmatch(error.message)

@@ -17,7 +17,7 @@ import msgspec
 
 from mwdcal.calibration.readings import TRIADS
 from mwdcal.digests import sha256_of
-from mwdcal.errors import InputError, reason
+from mwdcal.errors import InputError, reason, shell_word
 from mwdcal.files.contract import CHANNELS, MAPPED, TEMPERATURE, units_of
 from mwdcal.files.formats.table import shown
 from mwdcal.files.metadata import LARGEST_TOML, load_toml, toml
@@ -145,7 +145,11 @@ def read_toml(name: str, folder: str, kind: str) -> tuple[bytes, str]:
             "Name a file such as tool.toml."
         )
     if path.suffix.lower() == _SUFFIX:
-        remedy = f", or make one: mwdcal profile TABLE -o {name}" if folder == "profiles" else ""
+        remedy = (
+            f", or make one: mwdcal profile TABLE -o {shell_word(name)}"
+            if folder == "profiles"
+            else ""
+        )
         raise InputError(f"{kind}: there is no file '{name}'. Check the path{remedy}.")
     names = built_in(folder)
     near = difflib.get_close_matches(name.lower(), names, n=2)
@@ -195,8 +199,8 @@ def decoded_profile(data: bytes, source: str) -> Profile:
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         if Path(source).suffix.lower() != _SUFFIX:
             raise InputError(
-                f"{source} is no tool profile, which is a TOML file. For a table make one: mwdcal profile {source} "
-                "-o tool.toml."
+                f"{source} is no tool profile, which is a TOML file. For a table make one: mwdcal profile "
+                f"{shell_word(source)} -o tool.toml."
             ) from None
         raise _unreadable(data, error, source) from None
     check_profile(profile, source)

@@ -25,7 +25,7 @@ from mwdcal.calibration.readings import (
     serial_of,
 )
 from mwdcal.calibration.record import Finding
-from mwdcal.errors import FitError, InputError, QuestionError, UnreadableFileError
+from mwdcal.errors import FitError, InputError, QuestionError, UnreadableFileError, shell_word
 from mwdcal.estimation.problem import ANGLES, WALKS
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
@@ -210,7 +210,7 @@ def _undocumented(path: str | os.PathLike[str], error: InputError) -> InputError
     name = Path(path).name
     return InputError(
         f"{name} holds {where}, not written as a run file is. Propose a tool profile for it first, `mwdcal profile "
-        f"{name} -o tool.toml`, and name that by `tool`."
+        f"{shell_word(name)} -o tool.toml`, and name that by `tool`."
     )
 
 
@@ -575,7 +575,7 @@ def check_run(table: Table) -> None:
     if table.count > ROWS_OF_LOG and ("time_s" in table.columns or "sampling_hz" in table.metadata):
         raise InputError(
             f"{table.source} is a continuous log ({table.count} rows): its rows are not stations. Find "
-            f"the standstills first: mwdcal stations {table.source} -o run.csv. If each row is a "
+            f"the standstills first: mwdcal stations {shell_word(table.source)} -o run.csv. If each row is a "
             "station, remove time_s and sampling_hz."
         )
 

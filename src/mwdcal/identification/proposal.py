@@ -1742,10 +1742,10 @@ def warmth_by_unit(proposal: Proposal) -> list[Finding]:
     ]
     text = (
         "{} is taken as the temperature of the tool, as the only column in a unit of temperatures. If it is not, say "
-        "so: `column` 'temperature_c='."
+        'so: `column` "temperature_c=".'
         if source
         else "no column is called a temperature, and {} is in a unit of temperatures. If it is the tool's, say so: "
-        "`column` 'temperature_c={}'."
+        '`column` "temperature_c={}".'
     )
     return [Finding(id="temperature-by-unit", text=text.format(shown(n), n)) for n in warm]
 

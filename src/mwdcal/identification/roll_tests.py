@@ -423,17 +423,31 @@ def _with_sense(columns: Mapping[str, ColumnSource], profile: Profile) -> dict[s
 
 def scaled(profile: Profile, run: Mapping[str, ColumnSource]) -> Profile:
     """The profile of a later table with the scales of its run in the units of the table's channels."""
-    triads = {}
+    triads, known = {}, {*units_of("ref_gravity_g"), *units_of("ref_field_nt")}
+    unlike: dict[str, tuple[str, str]] = {}
     for kind in TRIADS:
         theirs, ours = (_unit(kind, each) for each in (run, runs.sources_of(profile)))
         factors = [FACTORS.get(unit, (1.0, 0.0))[0] for unit in (theirs, ours)]
         if theirs and ours and theirs != ours:
-            if not {theirs, ours} <= {*units_of("ref_gravity_g"), *units_of("ref_field_nt")}:
-                raise InputError(
-                    f"the {kind} reads in {ours} in this table, and in {theirs} in the run. Convert one of them."
-                )
+            if not {theirs, ours} <= known:
+                unlike[kind] = ours, theirs
             triads[kind] = _times(getattr(profile, kind), factors[0] / factors[1])
+    if unlike:
+        raise InputError(_of_other_units(unlike))
     return msgspec.structs.replace(profile, **triads)
+
+
+def _of_other_units(unlike: Mapping[str, tuple[str, str]]) -> str:
+    """Triads whose unit in a table cannot be converted to that of the run, and what to do."""
+    reads = " and ".join(f"the {kind} reads in {ours}" for kind, (ours, _) in unlike.items())
+    theirs = " and ".join(dict.fromkeys(unit for _, unit in unlike.values()))
+    units = " and ".join(
+        f'unit = "{ours}" for {", ".join(CHANNELS[kind])}' for kind, (ours, _) in unlike.items()
+    )
+    return (
+        f"{reads} in this table, and in {theirs} in the run. If the run was in the table's units too, write {units} "
+        "under [columns] of the tool profile and calibrate again. Else convert one of them."
+    )
 
 
 def _unit(kind: str, columns: Mapping[str, ColumnSource]) -> str:

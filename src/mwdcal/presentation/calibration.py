@@ -32,6 +32,7 @@ from mwdcal.calibration.record import (
     exact_and_steady,
 )
 from mwdcal.calibration.results import typical_accuracy, without_temperature
+from mwdcal.errors import shell_word
 from mwdcal.files import documents
 from mwdcal.files.contract import AZIMUTH_KEYS
 from mwdcal.geometry.observables import TITLES
@@ -182,7 +183,8 @@ def screen(
         files.append(files_written(report=report))
     verdict, step = judged
     if not verdict:
-        step = f"\nnext: mwdcal verify {one_line(output)} {one_line(rolltest or NEXT_ROLL_TEST)}"
+        tested = shell_word(str(rolltest or NEXT_ROLL_TEST))
+        step = "\n" + one_line(f"next: mwdcal verify {shell_word(str(output))} {tested}")
     ending = "\n".join(files) + step
     return "\n\n".join([*filter(None, [verdict]), body(calibration, tried), ending])
 

@@ -24,7 +24,7 @@ from mwdcal.calibration.results import (
     without_temperature,
 )
 from mwdcal.certificate.decisions import coverage_of, expanded_of
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, shell_word
 from mwdcal.estimation.solvers import RANK_TOLERANCE
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.calibration import (
@@ -248,20 +248,21 @@ def _steps(
     calibration: Calibration, verdict: Verdict | None, file: str, rolltest: str
 ) -> list[str]:
     """Steps after the calibration: stations to measure again, then the next command."""
-    count = sum(row.reshoot for row in calibration.station_rows)
+    count, named = sum(row.reshoot for row in calibration.station_rows), file
+    file, test = map(shell_word, (named, verdict.run if verdict else rolltest))
     steps = [f"Measure {plural(count, 'station')} again, and calibrate once more."] if count else []
     if verdict is None:
         return [
             *steps,
-            f"Verify the calibration with a roll test that the fit has not seen: mwdcal verify {file} {rolltest}",
+            f"Verify the calibration with a roll test that the fit has not seen: mwdcal verify {file} {test}",
         ]
     if verdict.passed:
         return [
             *steps,
-            f"Keep the verdict: mwdcal verify {file} {verdict.run} -o verdict.json",
+            f"Keep the verdict: mwdcal verify {file} {test} -o verdict.json",
             f"Issue the certificate: mwdcal certificate {file} --verification verdict.json -o certificate.pdf",
         ]
-    again, command, reason = after_failure(verdict, file, verdict.run)
+    again, command, reason = after_failure(verdict, named, verdict.run)
     return [*steps, f"{capital(again)}.", f"{capital(reason)}: {command}"]
 
 

@@ -33,6 +33,7 @@ from mwdcal.certificate.document import (
     ResultTable,
     TracedStandard,
 )
+from mwdcal.errors import shell_word
 from mwdcal.files.documents import laid_out
 from mwdcal.presentation.numbers import (
     UNDETERMINED,
@@ -148,8 +149,8 @@ def _after_failed(certificate: Certificate) -> Iterator[str]:
     test = certificate.as_left
     if test and not test.passed:
         names = [file.name for file in certificate.files if file.id == "calibration"]
-        calibration = one_line(names[0] if names else "CAL.json")
-        yield f"next: mwdcal diagnose {calibration} {one_line(test.run)}   (what the failure looks like)"
+        files = " ".join(map(shell_word, (names[0] if names else "CAL.json", test.run)))
+        yield f"next: mwdcal diagnose {one_line(files)}   (what the failure looks like)"
 
 
 def heading(certificate: Certificate) -> list[str]:

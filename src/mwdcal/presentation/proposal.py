@@ -11,6 +11,7 @@ from msgspec.structs import asdict
 
 from mwdcal.calibration.readings import TRIADS, simulated
 from mwdcal.calibration.record import Finding
+from mwdcal.errors import shell_word
 from mwdcal.files.contract import RANGES
 from mwdcal.files.formats.columns import WORKBOOKS
 from mwdcal.files.formats.layout import Layout
@@ -113,12 +114,14 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
         table(rows, ["triad", "axes", "nominal scale", "variation left", "by the next best axes"])
     )
     if output:
-        result = one_line(output.with_suffix(".json"))
-        command = f"mwdcal calibrate {one_line(run)} --tool {one_line(output)} -o {result}"
-        command += f" --rolltest {one_line(run)}" if has_roll_test else ""
+        table_file, tool, result = map(
+            shell_word, map(str, (run, output, output.with_suffix(".json")))
+        )
+        command = f"mwdcal calibrate {table_file} --tool {tool} -o {result}"
+        command += f" --rolltest {table_file}" if has_roll_test else ""
         command += page_option(output.with_suffix(".html"))
         if depths_of_surveys(proposal):
-            command = f"mwdcal survey TOOL.json {one_line(run)} -o well.csv"
+            command = f"mwdcal survey TOOL.json {table_file} -o well.csv"
             command += page_option("well.html")
         else:
             first = ["add stations at other inclinations"] if proposal.level else []
@@ -129,7 +132,7 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
             if has_angles(proposal) and not stand_in_settings()
             else ""
         )
-        blocks.append(f"{exact}{files_written(profile=output)}   next: {command}")
+        blocks.append(f"{exact}{files_written(profile=output)}   next: {one_line(command)}")
     return "\n\n".join(blocks)
 
 

@@ -28,7 +28,7 @@ from mwdcal.certificate.signature import (
     trusted,
 )
 from mwdcal.certificate.signature import check as check_signature
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, shell_word
 from mwdcal.files import documents
 from mwdcal.files.formats.members import Member
 from mwdcal.presentation.calibration_source import calibration_file
@@ -190,7 +190,7 @@ def checked(result: CheckedDocument, fields: Mapping[str, Any]) -> str:
     first = [outcome, one_line(result.file), *simulated(_stated(fields))]
     lines = ["   ".join(first), *[one_line(result.check.text)] * (result.check.state == "intact")]
     if not result.passed:
-        file = one_line(result.file)
+        file = one_line(shell_word(result.file))
         lines.append(
             f"next: mwdcal certificate verify {file} --key K.pub   (the file as its owner issued it)"
         )

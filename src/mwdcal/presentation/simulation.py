@@ -12,6 +12,7 @@ import numpy as np
 from mwdcal.calibration.readings import SIMULATED
 from mwdcal.calibration.record import Finding
 from mwdcal.calibration.results import STATED_ANGLES
+from mwdcal.errors import shell_word
 from mwdcal.geometry.vectors import AnyArray
 from mwdcal.planning.plans import Effects
 from mwdcal.planning.procedure import CALIBRATED, PERCENTILES, Judged, Repetition, Share
@@ -110,7 +111,9 @@ def screen(document: Mapping[str, Any]) -> str:
     )
     blocks = [one_line("   ".join(head)), errors]
     if document["output"]:
-        follow = f"next: mwdcal calibrate {document['output']} --tool TOOL.toml -o CAL.json"
+        follow = (
+            f"next: mwdcal calibrate {shell_word(document['output'])} --tool TOOL.toml -o CAL.json"
+        )
         files = files_written(run=document["output"], truth=document["truth"])
         blocks.append(f"{files}   {one_line(follow)}")
     return "\n\n".join(blocks)

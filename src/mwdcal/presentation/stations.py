@@ -11,6 +11,7 @@ import numpy as np
 from mwdcal.calibration.diagnosis.findings import UNUSED
 from mwdcal.calibration.readings import serial_of
 from mwdcal.calibration.record import Finding
+from mwdcal.errors import shell_word
 from mwdcal.files.contract import RAW
 from mwdcal.geometry.vectors import Array
 from mwdcal.logs.station_means import ALL_STILL
@@ -103,7 +104,7 @@ def shown_in(plot: Path | None, report: Path | None) -> str:
 
 def next_command(output: str) -> str:
     """The advice for the run."""
-    return f"mwdcal calibrate {output} -o CAL.json"
+    return f"mwdcal calibrate {shell_word(output)} -o CAL.json"
 
 
 def heading(stations: Stations) -> list[str]:
@@ -229,7 +230,8 @@ def _banner(stations: Stations, output: str, why: str) -> dict[str, str]:
         f"{plural(stations.table.count, 'station')} found – at rest {share(stations)} of the time"
     )
     if ALL_STILL in ids:
-        after = f"A calibration needs several attitudes. Noise of the tool: mwdcal noise {stations.table.source}"
+        log = shell_word(stations.table.source)
+        after = f"A calibration needs several attitudes. Noise of the tool: mwdcal noise {log}"
         return banner("attention", "At rest throughout", headline, after)
     enter = f"enter the angles of the stand in {output} (ref_inclination_deg, …), then "
     stated = any(name.startswith("ref_") for name in stations.table.columns)

@@ -12,6 +12,8 @@ from importlib.util import find_spec
 from itertools import zip_longest
 from typing import Any, TypeAlias
 
+from mwdcal.errors import shell_word
+
 PATIENCE = 2.0
 """Seconds before there is any progress to see."""
 NARROWEST, WIDEST = 80, 160
@@ -68,7 +70,7 @@ def one_line(text: object) -> str:
 def page_option(page: object) -> str:
     """The option with which a next command writes a page too; blank where what draws it is not installed."""
     drawn = all(map(find_spec, ("jinja2", "matplotlib")))
-    return f" --report {one_line(page)}" if drawn else ""
+    return f" --report {one_line(shell_word(str(page)))}" if drawn else ""
 
 
 def escape_controls(text: str) -> str:

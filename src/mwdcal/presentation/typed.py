@@ -18,9 +18,9 @@ MOST_ALSO = 12
 """Most stations that a finding names besides its own."""
 IMPORTANT: tuple[str | tuple[str, ...], ...] = (
     "too-few", "channel", "missing-reference", "weak-geometry", "temperature-span",
-    "altered", "revoked", "unsound", "contradicted", "no-path", "not-judged", "not-verified", "partly-judged",
-    "axes-exchanged", "rejected", "path-from", "tie-in", "depths-count", "long-courses", "calibration-later",
-    "magnetic-north", "column-explains", ("reshoot", "settings "),
+    "altered", "revoked", "unsound", "other-tool", "contradicted", "no-path", "not-judged",
+    "not-verified", "partly-judged", "axes-exchanged", "rejected", "path-from", "tie-in", "depths-count",
+    "long-courses", "calibration-later", "magnetic-north", "column-explains", ("reshoot", "settings "),
     "repeated-readings", "misfit", "accelerometer-residuals", "magnetometer-residuals", "looks-like",
     "outside-temperature", "changed", "standard-overdue", "roll-test-read", "columns-read",
 )  # fmt: skip

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from mwdcal.calibration.readings import simulated
 from mwdcal.calibration.record import Finding, SignatureCheck
+from mwdcal.errors import shell_word
 from mwdcal.presentation.numbers import capital, measured, quantity, unit
 from mwdcal.presentation.signature import signature_status
 from mwdcal.presentation.text import NOT_STATED, chance, one_line, table
@@ -118,10 +119,11 @@ def after_failure(
 
     Where values failed: each place once, and the fault that it looks like. Else no value could be stated.
     """
+    record = one_line(shell_word(str(calibration)))
     failed = [row for row in result.rows if row.uncertainty is not None and not row.passed]
     places = dict.fromkeys(row.note.partition(";")[0] for row in failed)
     if places:
-        command = f"mwdcal diagnose {one_line(calibration)} {one_line(run)}"
+        command = f"mwdcal diagnose {record} {one_line(shell_word(str(run)))}"
         again = f"measure again: {'; '.join(places)}"
         if any(finding.id == "harmonic-unseen" for finding in result.findings):
             again += ", at six or more toolfaces, evenly spread"
@@ -131,9 +133,9 @@ def after_failure(
     if free := result.left_open:
         missing = [word for direction, word in REFERENCES_OF.items() if direction in free]
         again = f"not determined: {free}. Give {' and '.join(missing)} in the calibration run"
-        return again, f"mwdcal calibrate RUN -o {one_line(calibration)}", "with these references"
+        return again, f"mwdcal calibrate RUN -o {record}", "with these references"
     again = "measure again: the roll test, with what is missing in it"
-    return again, f"mwdcal verify {one_line(calibration)} ROLLTEST.csv", "the new roll test"
+    return again, f"mwdcal verify {record} ROLLTEST.csv", "the new roll test"
 
 
 def _far_everywhere(row: VerdictRow) -> bool:

@@ -30,6 +30,8 @@ from mwdcal.survey.stations import RANDOM, STRENGTHS, SURVEY_OBSERVABLES, Survey
 STRENGTH_NAMES = SURVEY_OBSERVABLES[STRENGTHS]
 LEAST_FREE = 1e-12
 """Share of a variance that is of its quantity alone, at least: the rounding of a correlation."""
+LARGEST_SPREAD = 0.25
+"""Departures are alike if their middle half spans less than this share of the median."""
 SURVEY_UNITS = {
     "gravity": ("mg", 1e3, 2),
     "field": ("nT", 1.0, 0),
@@ -183,6 +185,21 @@ class Judgement:
             "" if good else self._finding(i) if some else "not judged: no reference"
             for i, (good, some) in enumerate(zip(plain, judged, strict=True), rows.start or 0)
         ]
+
+    def alike(self) -> list[str]:
+        """The strengths of which most departures are beyond the bound, and the middle half of all is close together."""
+        parts = []
+        for off, most, (name, (unit, factor, digits)) in zip(
+            self.departure.T, self.bound.T, SURVEY_UNITS.items(), strict=True
+        ):
+            there = ~np.isnan(off)
+            low, middle, high = (
+                np.quantile(off[there], [0.25, 0.5, 0.75]) if there.any() else np.zeros(3)
+            )
+            beyond = np.mean(np.abs(off[there]) > most[there]) if there.any() else 0.0
+            if beyond > 0.5 and high - low < LARGEST_SPREAD * abs(middle):
+                parts.append(f"{name} by {middle * factor:+.{digits}f} {unit}")
+        return parts
 
     def _finding(self, i: int) -> str:
         off, most = self.departure[i].tolist(), self.bound[i].tolist()

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mwdcal.calibration.diagnosis.identity import other_tool
 from mwdcal.calibration.diagnosis.refusals import SIGNED
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration, Finding
@@ -23,6 +24,8 @@ NAMED_BY_CHANCE = 1e-3
 """Largest share of sound runs that fit other axes so much better."""
 AS_LIKELY = 100.0
 """Exchanges of which the likelihood is less than so many times smaller fit as well: the simplest is named."""
+MISFIT_LEFT = 0.1
+"""Other axes that leave less than this share of χ² explain a misfit, even where they do not fit by the noise."""
 SURVEYS_COMPARED = 40
 """Surveys of a run that are looked at: offsets and scales are the same at all."""
 _SAME = np.broadcast_to(np.eye(3), SIGNED.shape)
@@ -39,16 +42,18 @@ def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding
     """The finding that surveys of one well (n,) fit the calibration with other axes, and not with their own.
 
     Definition: χ² as of `interference_estimate.chi_square`, with interference and drift. Other axes are named if the
-    surveys fit with them, do not fit without, and their likelihood ratio exp(Δχ²/2) exceeds the number of alternatives
-    over `NAMED_BY_CHANCE`. The mean of such a ratio over sound runs is one, so that by Markov's inequality at most that
-    share of them is named. None where a magnetometer or references lack, the field is relative, or nothing tells the
-    axes apart; where the estimate fails, the finding says so.
+    surveys fit with them or leave `MISFIT_LEFT` of χ², do not fit without, and their likelihood ratio exp(Δχ²/2)
+    exceeds the number of alternatives over `NAMED_BY_CHANCE`. The mean of such a ratio over sound runs is one, so that
+    by Markov's inequality at most that share of them is named. None where a magnetometer or references lack, the field
+    is relative, the surveys are of another tool, or nothing tells the axes apart; where the estimate fails, the finding
+    says so.
     """
     from scipy.special import chdtrc
 
     if not calibration.has_field or readings.magnetometer is None or calibration.relative:
         return []
-
+    if other_tool(calibration, readings):
+        return []
     rows = usable(calibration, readings)
     for name in ("field", "dip"):
         rows = rows & np.isfinite(readings.reference(name))
@@ -69,7 +74,8 @@ def exchanged_axes(calibration: Calibration, readings: Readings) -> list[Finding
         text = f"whether columns are exchanged could not be judged: {error}"
         return [Finding(id="not-judged", text=text)]
     likelier = (named - others[best]) / 2 > np.log(len(EXCHANGES) / NAMED_BY_CHANCE)
-    if not likelier or chdtrc(freedom, others[best]) < LEAST_CHANCE:
+    fits = chdtrc(freedom, others[best]) >= LEAST_CHANCE or others[best] < MISFIT_LEFT * named
+    if not (likelier and fits):
         return []
     alike = others - others[best] < 2 * np.log(AS_LIKELY)
     simplest = EXCHANGES[int(np.argmin(np.where(alike, CHANGED, np.inf)))]

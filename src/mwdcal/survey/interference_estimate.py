@@ -15,6 +15,7 @@ import numpy as np
 
 from mwdcal.calibration import results
 from mwdcal.calibration.automatic.courses import OFFSETS
+from mwdcal.calibration.diagnosis.identity import other_tool
 from mwdcal.calibration.estimate import Fit, fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import PriorInformation, for_run
@@ -188,7 +189,7 @@ def surveys(calibration: Calibration, readings: Readings) -> Readings:
     """The readings as stations of unknown attitude, with the noise of the calibration where none is stated.
 
     Changes of field and dip from station to station count as noise of the magnetometer, by the larger of the two.
-    Raises `InputError` for a calibration or readings without a magnetometer, or without a reference.
+    Raises `InputError` for a calibration or readings without a magnetometer, or without a reference, or of two tools.
     """
     if not calibration.has_field or readings.magnetometer is None:
         raise InputError(
@@ -205,6 +206,11 @@ def surveys(calibration: Calibration, readings: Readings) -> Readings:
                 f"{readings.name}: interference is estimated from field and dip, and {column} is missing. Add it, "
                 "for example from mwdcal reference."
             )
+    if other := other_tool(calibration, readings):
+        raise InputError(
+            f"{readings.name} is of tool {other[1]}, the calibration of tool {other[0]}. Give the calibration of tool "
+            f"{other[1]}, or correct 'serial' in the table."
+        )
     calibration.fields(readings)
     shape = readings.accelerometer.shape
     sd = {t.name: np.broadcast_to(t.noise_of(readings), shape) for t in calibration.triads}

@@ -309,14 +309,31 @@ def depths(table: Table, length_unit: str = "") -> Array | None:
     there = np.flatnonzero(~np.isnan(md))
     back = there[1:][np.diff(md[there]) < 0]
     if back.size:
-        raise not_deeper(table, int(back[0]), md[back[0]], length_unit)
+        known, row = md[there], int(back[0])
+        anew = back.size == 1 and _start_over(known[there < row], known[there >= row])
+        raise not_deeper(table, row, md[row], length_unit, TWO_PARTS if anew else UNSORTED)
     return md if there.size else None
 
 
-def not_deeper(table: Table, row: int, depth: float, length_unit: str = "") -> InputError:
+def _start_over(first: Array, second: Array) -> bool:
+    """Whether depths start over: in the upper half of the first part, with two stations of the second in it."""
+    return bool(second[0] <= np.median(first) and second[:2].max() <= first[-1] and second[1:].size)
+
+
+UNSORTED = "Sort the stations by measured depth."
+TWO_PARTS = (
+    "The depths start over there: is the table in it twice? Delete the copy. If it is the next run of the well, put "
+    "its rows into another table, and name that by `run`."
+)
+"""What to do about depths that decrease: at any row, or once, where a second table seems to begin."""
+
+
+def not_deeper(
+    table: Table, row: int, depth: float, length_unit: str = "", remedy: str = UNSORTED
+) -> InputError:
     """A measured depth, m, that is not beyond that of the station before."""
     name, factor = depth_column(table, length_unit)
-    problem = f"must not decrease from station to station; got {depth / factor:g}. Sort the stations by measured depth."
+    problem = f"must not decrease from station to station; got {depth / factor:g}. {remedy}"
     return cell_error(table, name, row, problem)
 
 

@@ -322,6 +322,8 @@ Start = tuple[float, float, float] | TieIn | PathEnd
 AXES_OF_EARTH = ("north", "east", "tvd")
 WELL_FINDINGS = {
     "rejected": "{rejected} of {judged} surveys lie outside the limits '{limits}' (first: station {first}: {why}).",
+    "rejected-alike": "most surveys depart alike: {alike} (median). Likely a reference is wrong: that of the well's "
+    "place, or of the calibration's stand. At one attitude interference of the drill string looks the same.",
     "blind-to-interference": "acceptance is blind to interference of the drill string at {blind} of {accepted} "
     "accepted surveys. At station {blindest} {worst}. Use `msa`: surveys at another attitude show what is along the "
     "tool, rotation shots (four toolfaces at one depth) what is across it. Or measure a check azimuth.",
@@ -875,8 +877,10 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
     years, course = _years(calibrated, day) or 0.0, _usual_course(result.position)
     lacking = [n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks]
     walks = result.errors is not None and result.errors.by_walk
+    alike = ", ".join(result.judgement.alike())
     applies = {
         "rejected": counts.rejected,
+        "rejected-alike": 2 * counts.rejected > counts.judged and alike,
         "blind-to-interference": counts.blind,
         "rejected-on-path": counts.rejected_on_path,
         "not-judged": counts.unjudged,
@@ -895,7 +899,7 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "rejected": counts.rejected, "judged": counts.judged, "limits": result.limits.name, "rows": counts.rows,
         "first": first, "why": why, "start": label, "blind": counts.blind, "accepted": counts.accepted,
         "names": " and ".join(lacking), "references": " and ".join(REFERENCES[n].column for n in lacking),
-        "blindest": blindest, "worst": worst, "partly": counts.partly, "unjudged": counts.unjudged,
+        "blindest": blindest, "alike": alike, "worst": worst, "partly": counts.partly, "unjudged": counts.unjudged,
         "count": counts.rows - counts.on_path, "years": years, "day": day, "calibrated": calibrated, "course": course,
         "usual": USUAL_COURSE, "lacking_path": LACKING_PATH[counts.located],
         "drift": OLD_DRIFT[DRIFT in result.terms.included],

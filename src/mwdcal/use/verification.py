@@ -13,7 +13,7 @@ import numpy as np
 from mwdcal.calibration.copies import in_fit
 from mwdcal.calibration.diagnosis.identity import doubts, other_tool
 from mwdcal.calibration.options import ASSUMED, UNSHARED, is_assumed, unshared
-from mwdcal.calibration.readings import STAND_ANGLES_EXACT, Readings
+from mwdcal.calibration.readings import STAND_ANGLES_EXACT, Readings, stated_day
 from mwdcal.calibration.record import (
     MARGIN,
     STATE_STAND,
@@ -23,6 +23,7 @@ from mwdcal.calibration.record import (
     html_table,
     stated,
 )
+from mwdcal.calibration.results import unknown_gravity
 from mwdcal.errors import InputError
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, eigen
@@ -136,6 +137,12 @@ SETTING_PRACTICES = {
     "per-station": "The stand was set at every station: its errors average down over a roll set.",
 }
 """How often the stand's direction was set, in words."""
+DAILY_CHANGES = {
+    "gravity": ("gravity_g", "gravity_g", 5e-4, 4),
+    "field": ("field", "field_nt", 200.0, 0),
+    "dip": ("dip_deg", "dip_deg", 0.2, 2),
+}
+"""Keys of `Calibration.earth` and `[stand]`, largest change in a day with the rounding of sheets, and decimals."""
 WEAK = 0.5
 """A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
 NAMED_HARMONIC = 3.0
@@ -157,6 +164,8 @@ VERDICT_FINDINGS = {
     "not-judged": "not judged: {limits}.",
     "contradicted": "the readings contradict references of the run that no limit judges: {what}. Check their unit, "
     "sign and place; or signs or axes of a sensor are exchanged. The verdict says nothing about it.",
+    "contradicted-by-run": "the calibration's run and this test are of one day and state different references: {what}. "
+    "Unless they were at two places, correct the wrong one; one of the run is an error of every survey.",
     "no-roll-set": "no roll set: spreads were not judged.",
     "stand-exact": "the angles of the stand count as exact in this test, and did not in the calibration's run: the "
     "errors and the risk are too small by those of the stand. State their 1σ, by `sd` of mwdcal.readings or in "
@@ -421,6 +430,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
         findings=[
             *_findings(test, skipped),
             *_contradicted(test, limits),
+            *_differing(test),
             *_remarks(judged, STATE_STAND * (STAND_ANGLES_EXACT in calibration.assumed_exact)),
             *chain(*(j.findings for j in judged)),
         ],
@@ -549,6 +559,29 @@ def _contradicted(test: RollTest, limits: Limits) -> Iterator[Finding]:
             parts.append(f"{name} by {size:+.3g}{'' if unit == '°' else ' '}{unit}")
     if parts:
         yield _finding("contradicted", what=", ".join(sorted(parts)))
+
+
+def _differing(test: RollTest) -> Iterator[Finding]:
+    """References that the calibration's run of the same day states otherwise; in a coil gravity alone counts."""
+    calibration, readings, parts = test.calibration, test.readings, []
+    stand, day = calibration.profile.stand, stated_day(readings.metadata)
+    unstated = {constant.name for constant in calibration.constants}
+    unstated |= {"gravity"} if unknown_gravity(calibration) else set()
+    unstated |= {"field", "dip"} if calibration.relative or stand.coil else set()
+    if day is None or day != stated_day(calibration.tool):
+        return
+    for name, (key, declared, most, decimals) in DAILY_CHANGES.items():
+        here = np.asarray(readings.known.get(name, np.nan), float)
+        if name in unstated or key not in calibration.earth or np.isnan(here).all():
+            continue
+        unit = OBSERVABLES[name].unit.replace("rad", "°")
+        value, sd = (_scale(unit) * np.nanmean(x) for x in (here, readings.uncertainty(name)))
+        theirs = calibration.earth[key]
+        if abs(value - theirs) > most + COVERAGE * np.hypot(sd, stand.of(declared)):
+            unit = unit if unit == "°" else f" {unit}"
+            parts.append(f"{name} {theirs:.{decimals}f}{unit} and {value:.{decimals}f}{unit}")
+    if parts:
+        yield _finding("contradicted-by-run", what=", ".join(parts))
 
 
 def _finding(name: str, **values: object) -> Finding:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mwdcal.app.commands import options
 from mwdcal.app.messages import print_result
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, shell_word
 
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
@@ -56,12 +56,11 @@ def command(folder: Path, as_json: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     atomic.write_all(zip(files, contents, strict=True))
     names = ("run.csv", "tool.toml", "tool.json")
-    run, tool, result = (one_line(folder / name) for name in names)
+    run, tool, result = (shell_word(str(folder / name)) for name in names)
     rows = [[str(file), what] for file, what in zip(files, CONTENTS.values(), strict=True)]
     screen = f"{table(rows, [f'wrote, all {SIMULATED}', ''])}\n\n"
-    screen += (
-        f"next: mwdcal calibrate {run} --tool {tool} -o {result}{page_option(folder / 'tool.html')}"
-    )
+    page = page_option(folder / "tool.html")
+    screen += one_line(f"next: mwdcal calibrate {run} --tool {tool} -o {result}{page}")
     written = ExampleDocument(folder=str(folder), files=[str(file) for file in files])
     document = json_document("example", written, {"simulated": True})
     print_result(document if as_json else screen)

@@ -278,7 +278,9 @@ def _check_positions(
     """Refuse options on positions of a well that has none."""
     from mwdcal.survey.surveying import check_path
 
-    lacking = next((each.text for each in result.well.findings if each.id == "no-path"), "")
+    texts = {each.id: each.text for each in result.well.findings}
+    causes = [texts[each] for each in ("no-path", "outside-temperature") if each in texts]
+    lacking = " ".join(causes) if "no-path" in texts else ""
     options_on_path = {"section_azimuth": section, "covariance": covariance, "listing": listing}
     check_path(lacking, tie_in=tie_in, **options_on_path)
 
@@ -339,15 +341,15 @@ def _print(
     print_result(shown, findings_with_option_names(screens.all_findings(facts)))
 
 
-def _numbers(name: str, text: str, count: int) -> list[float]:
-    """Numbers with commas between them."""
+def _numbers(name: str, text: str, *counts: int) -> list[float]:
+    """Numbers with commas between them, as many as one of the counts."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
-    if len(values) != count or not all(abs(value) < 1e9 for value in values):
+    if len(values) not in counts or not all(abs(value) < 1e9 for value in values):
         raise InputError(
-            f"`{name}` must be {count} numbers with commas between them; got {text!r}."
+            f"`{name}` must be {' or '.join(map(str, counts))} numbers with commas between them; got {text!r}."
         )
     return values
 
@@ -358,7 +360,7 @@ def _tie_in(text: str | None, unit: str) -> tuple[float, float, float] | TieIn |
 
     if text is None:
         return None
-    numbers = _numbers("tie_in", text, 6 if text.count(",") > 2 else 3)
+    numbers = _numbers("tie_in", text, 3, 6)
     return start_of(numbers, length_unit_of(unit)[1])
 
 
