@@ -113,27 +113,29 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
     blocks.append(
         table(rows, ["triad", "axes", "nominal scale", "variation left", "by the next best axes"])
     )
-    if output:
-        table_file, tool, result = map(
-            shell_word, map(str, (run, output, output.with_suffix(".json")))
-        )
-        command = f"mwdcal calibrate {table_file} --tool {tool} -o {result}"
-        command += f" --rolltest {table_file}" if has_roll_test else ""
-        command += page_option(output.with_suffix(".html"))
-        if depths_of_surveys(proposal):
-            command = f"mwdcal survey TOOL.json {table_file} -o well.csv"
-            command += page_option("well.html")
-        else:
-            first = ["add stations at other inclinations"] if proposal.level else []
-            first += [f"fill in the axes in {one_line(output)}"] if proposal.open_axes else []
-            command = f"{', '.join(first)}, then {command}" if first else command
-        exact = (
-            f"The angles of the stand count as exact until [stand] in {one_line(output)} states their 1σ.\n"
-            if has_angles(proposal) and not stand_in_settings()
-            else ""
-        )
-        blocks.append(f"{exact}{files_written(profile=output)}   next: {one_line(command)}")
+    blocks += [_next(proposal, run, output, has_roll_test)] if output else []
     return "\n\n".join(blocks)
+
+
+def _next(proposal: Proposal, run: Path, output: Path, has_roll_test: bool) -> str:
+    """The file that was written, and the command that takes it."""
+    table_file, tool, result = map(shell_word, map(str, (run, output, output.with_suffix(".json"))))
+    command = f"mwdcal calibrate {table_file} --tool {tool} -o {result}"
+    command += f" --rolltest {table_file}" if has_roll_test else ""
+    command += page_option(output.with_suffix(".html"))
+    if depths_of_surveys(proposal):
+        command = f"mwdcal survey TOOL.json {table_file} -o well.csv"
+        command += page_option("well.html")
+    else:
+        first = ["add stations at other inclinations"] if proposal.level else []
+        first += [f"fill in the axes in {one_line(output)}"] if proposal.open_axes else []
+        command = f"{', '.join(first)}, then {command}" if first else command
+    exact = (
+        f"The angles of the stand count as exact until [stand] in {one_line(output)} states their 1σ.\n"
+        if has_angles(proposal) and not stand_in_settings()
+        else ""
+    )
+    return f"{exact}{files_written(profile=output)}   next: {one_line(command)}"
 
 
 def _of_place(proposal: Proposal) -> list[list[str]]:
