@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from mwdcal.errors import InputError, QuestionError
+from mwdcal.files.formats import layout
 from mwdcal.files.formats import table as tables
 
 NAMES = "Inc,Azi,TF,Gx,Gy,Gz,Bx,By,Bz"
@@ -76,3 +78,51 @@ def test_readings_of_another_table_state_no_reference(tmp_path: Path) -> None:
     path.write_text("\n".join([*A, FIELD, names, *FIRST, *second, names, *SECOND]) + "\n")
     for each in tables.every_table(path):
         assert (each.titles.metadata["ref_field_nt"], each.titles.choices) == (49820.0, {})
+
+
+def sheet(name: str, channel: str = "Gx", count: int = 9, again: bool = False) -> layout.Sheet:
+    """A sheet of readings, with a table more below where they come `again`."""
+    rows = [
+        NAMES.replace("Gx", channel).split(","),
+        *([float(c) for c in x.split(",")] for x in FIRST[:count]),
+    ]
+    every = [*rows, ["Serial no.", "DM-4472"], *rows] if again else rows
+    return layout.Sheet(name, [*enumerate(every, 1)])
+
+
+WANTED = ("Gx", "Gy", "Gz", "Bx", "By", "Bz")
+
+
+def test_a_sheet_with_a_renamed_column_is_not_passed_over_for_another() -> None:
+    """An old sheet, or a roll test, is not the run because it still has all names."""
+    renamed = sheet("Positions", "Accel X")
+    with pytest.raises(
+        QuestionError, match=r"'Positions' has no column 'Gx'; sheet 'Positions 2024' has"
+    ):
+        layout.laid_out([renamed, sheet("Positions 2024")], "w.xlsx", wanted=WANTED)
+    with pytest.raises(
+        InputError, match="'Positions' has no column 'Gx'; sheet 'Roll test' has, and is a roll"
+    ):
+        layout.laid_out([renamed, sheet("Roll test")], "w.xlsx", wanted=WANTED)
+
+
+def test_a_sheet_of_another_name_or_the_one_that_is_named_is_read() -> None:
+    alone = layout.laid_out(
+        [sheet("Run 2025-03"), sheet("Roll test", count=8)], "w.xlsx", wanted=WANTED
+    )
+    assert alone.sheet == "Run 2025-03"
+    both = [sheet("Positions", "Accel X"), sheet("Positions 2024")]
+    assert (
+        layout.laid_out(both, "w.xlsx", sheet="Positions 2024", wanted=WANTED).sheet == both[1].name
+    )
+
+
+def test_tables_on_two_sheets_and_twice_on_one_are_told_apart() -> None:
+    with pytest.raises(QuestionError) as question:
+        layout.laid_out([sheet("A", again=True), sheet("B")], "w.xlsx")
+    answers = {each.arguments for each in question.value.answers}
+    assert (("sheet", "B"),) in answers
+    assert {
+        (("sheet", "A"), ("header_row", "1")),
+        (("sheet", "A"), ("header_row", "12")),
+    } <= answers

@@ -286,6 +286,8 @@ def laid_out(
     if not tables:
         raise _no_table(source, header_line, wanted, every)
     best = max(tables, key=lambda layout: layout.size)
+    if not kind and not header_line:
+        _check_renamed(best, [t for t in every if t not in tables], source, wanted)
     alike = _alike_among(tables, best)
     if len(alike) > 1 and not header_line and not kind:
         run = _the_run(alike)
@@ -650,18 +652,19 @@ def _completed(block: Titles, others: Iterable[Titles]) -> Titles:
 
 def _alike_among(tables: Sequence[Layout], best: Layout) -> list[Layout]:
     """The tables that may be meant as well as the largest, `best`: those of some size, or all that are one run."""
-    alike = [t for t in tables if t is best or _alike(t, best)]
+    alike = [
+        t for t in tables if t is best or _share_columns(t, best) or _are_of_one_triad_each(t, best)
+    ]
     runs = [t for t in alike if not _kind_of(t)]
     if len(runs) > 1 and _is_one_run(runs):
         return alike
     return [t for t in alike if t is best or len(t.lines) >= _BESIDES]
 
 
-def _alike(one: Layout, other: Layout) -> bool:
-    """Whether two tables share most of their columns, in whatever spelling, or are of one triad each."""
+def _share_columns(one: Layout, other: Layout) -> bool:
+    """Whether two tables share most of their columns, in whatever spelling."""
     ours, theirs = ({*_spelling(each.names)} for each in (one, other))
-    most = len(ours & theirs) >= _SHARED * max(len(ours), len(theirs))
-    return most or _are_of_one_triad_each(one, other)
+    return len(ours & theirs) >= _SHARED * max(len(ours), len(theirs))
 
 
 def _no_table(
@@ -686,16 +689,42 @@ def _no_table(
     )
 
 
+def _check_renamed(
+    table: Layout, others: Sequence[Layout], source: str, wanted: Collection[str]
+) -> None:
+    """Refuse a table as the run where one of the `others` is like it but for names of columns that are `wanted`."""
+    for other in (t for t in others if not _kind_of(t) and len(t.lines) >= _BESIDES):
+        if not _share_columns(other, table):
+            continue
+        absent = [shown(name) for name in wanted if name not in other.names]
+        columns = "column" if len(absent) == 1 else "columns"
+        on_sheets = other.sheet != table.sheet
+        here, there = (
+            f"sheet {shown(t.sheet)}" if on_sheets else f"the table in row {t.form.header_line}"
+            for t in (other, table)
+        )
+        problem = f"{source}: {here} has no {columns} {', '.join(absent)}"
+        advice = "correct its names in the table or in [columns] of the tool profile"
+        if kind := _kind_of(table):
+            raise InputError(f"{problem}; {there} has, and is a {kind}.")
+        key = f'sheet = "{table.sheet}"' if on_sheets else f"header_line = {table.form.header_line}"
+        text = f"{problem}; {there} has. If {here} is the run, {advice}; if {there} is, put {key} into its [table]."
+        raise QuestionError(text, [])
+
+
 def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError:
     places = [
         f"{f'sheet {shown(t.sheet)}, ' if t.sheet else ''}row {t.form.header_line} ({len(t.lines)} rows)"
         for t in sorted(tables, key=lambda t: (t.sheet, t.form.header_line))
     ]
-    by_sheet = len({t.sheet for t in tables}) == len(tables) and not sheet
+    counts = Counter(t.sheet for t in tables)
     answers = [
         Answer(
             f"{shown(t.sheet) if t.sheet else 'row'} {t.form.header_line}, {len(t.lines)} rows",
-            (("sheet", t.sheet) if by_sheet else ("header_row", str(t.form.header_line)),),
+            (
+                *[("sheet", t.sheet)] * (len(counts) > 1 and not sheet),
+                *[("header_row", str(t.form.header_line))] * (counts[t.sheet] > 1),
+            ),
         )
         for t in tables
     ]
