@@ -80,6 +80,7 @@ from mwdcal.identification.columns import (
     in_units,
     is_computed,
     is_filler,
+    is_near,
     is_not_of_tool,
     is_of_surroundings,
     is_of_tool,
@@ -1663,6 +1664,11 @@ def left_handed(proposal: Proposal) -> list[Finding]:
 _OTHER_SIGN = str.maketrans("+-", "-+")
 
 
+_FACT = re.compile(r"\D{3,40}\d+([.,]\d+)*\W*([^\W\d_]\S{0,5})?\W*")
+"""A line of a few words, a number and perhaps its unit."""
+_OF_PLACE_ALONE = tuple(REFERENCES[name].column for name in STATED_REFERENCES)
+
+
 def lines_not_taken(proposal: Proposal) -> list[Finding]:
     """A finding on each reference beside the table that is nominal or unclear, where the run has no other, or another.
 
@@ -1682,8 +1688,12 @@ def lines_not_taken(proposal: Proposal) -> list[Finding]:
         for column, (line, other) in block.others.items()
         if column in stated and not (column in named and named[column].name in proposal.where.names)
     ]
-    lines = {c: shown(t)[1:-1] for c, t in block.not_taken.items() if c not in {*named, *stated}}
-    return others + references_not_taken(lines)
+    facts = (text for text in proposal.where.above if _FACT.fullmatch(text))
+    near = {c: t for t in facts for c in _OF_PLACE_ALONE if is_near(c, t)}
+    lines = {c: shown(t)[1:-1] for c, t in (near | {**block.not_taken}).items()}
+    return others + references_not_taken(
+        {c: t for c, t in lines.items() if c not in {*named, *stated}}
+    )
 
 
 def answers_by_readings(proposal: Proposal) -> list[Finding]:
