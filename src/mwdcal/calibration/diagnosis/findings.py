@@ -255,6 +255,45 @@ def references_not_taken(lines: Mapping[str, str]) -> list[Finding]:
     ]
 
 
+_OTHER_SIGN = str.maketrans("+-", "-+")
+
+
+def is_left_handed(axes: Sequence[str]) -> bool:
+    """Whether the `axes` of a triad make a left-handed set of its channels x, y, z.
+
+    >>> is_left_handed(("+y", "+x", "+z")), is_left_handed(("-y", "+x", "+z"))
+    (True, False)
+    """
+    letters = "".join(axis[1] for axis in axes)
+    odd = letters not in ("xyz", "yzx", "zxy")
+    return odd != ("".join(axes).count("-") % 2 == 1)
+
+
+def left_handed(axes: Mapping[str, Sequence[str]]) -> list[Finding]:
+    """A finding on triads whose channels x, y, z are a left-handed set by their axes.
+
+    Not on an accelerometer whose channels all read opposite to those of the magnetometer: positive upwards, as many do.
+    """
+    triads = [kind for kind, each in axes.items() if is_left_handed(each)]
+    others = [kind for kind in axes if kind not in triads]
+    opposite = [tuple(axis.translate(_OTHER_SIGN) for axis in axes[kind]) for kind in triads]
+    if not triads or (others and opposite == [tuple(axes[others[0]])]):
+        return []
+    reason = (
+        f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read roll "
+        "test and surveys with the same wiring"
+        if others
+        else "a reference angle counts the other way: toolface anticlockwise, or inclination from below"
+    )
+    return [
+        Finding(
+            id="left-handed",
+            text=f"{' and '.join(triads)}: by the `axes` of the profile the channels x, y, z are a left-handed set. If "
+            f"the tool is not built so, {reason}.",
+        )
+    ]
+
+
 def magnetometer_absent(references: Iterable[str]) -> list[Finding]:
     """A finding on references of the field that a table states which has no magnetometers."""
     stated = " and ".join(sorted({*references} & {"field", "dip"}, reverse=True))
@@ -307,7 +346,9 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield from _undetermined(fitted)
     yield from _prior(fitted)
     yield from _model(fitted)
-    for each in of_table(fitted.readings):
+    triads = zip(TRIADS, fitted.result.problem.triads, strict=False)
+    axes = {name: getattr(fitted.profile, name).axes for name, _ in triads}
+    for each in [*left_handed(axes), *of_table(fitted.readings)]:
         yield _common(fitted, each.id, each.text, range(fitted.count))
     yield from _culprits(fitted)
     yield _distrusted(fitted)
