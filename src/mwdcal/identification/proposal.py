@@ -1484,16 +1484,13 @@ def _wirings(
         if is_clear(result):
             results[kind] = result
             _check_independent(readings, results)
-        elif len(result.alternatives) == 1 or result.unexplained > UNRELATED:
-            raise FitError(f"{run.source}: {_unexplained(kind, result)}")
-        else:
-            reason, alternatives = "the stations do not tell the axes apart", result.alternatives
-            if pair := _exchanged_angles(kind, raw, readings, whole):
-                reason += (
-                    f", and would with {' and '.join(pair)} exchanged: exchange them by `column`"
-                )
-                alternatives = []
-            open_axes[kind] = OpenAxes(reason, alternatives, scale)
+            continue
+        pair = " and ".join(_exchanged_angles(kind, raw, readings, whole))
+        remedy = f" They fit with {pair} exchanged: exchange them by `column`." if pair else ""
+        if len(result.alternatives) == 1 or result.unexplained > UNRELATED:
+            raise FitError(f"{run.source}: {_unexplained(kind, result)}{remedy}")
+        reason = f"the stations do not tell the axes apart.{remedy}".removesuffix(".")
+        open_axes[kind] = OpenAxes(reason, [] if pair else result.alternatives, scale)
     return results, open_axes
 
 
@@ -1652,7 +1649,7 @@ def _alternatives(axes: OpenAxes) -> str:
 
 _FACT = re.compile(r"\D{3,40}\d+([.,]\d+)*\W*([^\W\d_]\S{0,5})?\W*")
 """A line of a few words, a number and perhaps its unit."""
-_OF_PLACE_ALONE = tuple(REFERENCES[name].column for name in STATED_REFERENCES)
+_STATED_COLUMNS = tuple(REFERENCES[name].column for name in STATED_REFERENCES)
 
 
 def lines_not_taken(proposal: Proposal) -> list[Finding]:
@@ -1675,7 +1672,7 @@ def lines_not_taken(proposal: Proposal) -> list[Finding]:
         if column in stated and not (column in named and named[column].name in proposal.where.names)
     ]
     facts = (text for text in proposal.where.above if _FACT.fullmatch(text))
-    near = {c: t for t in facts for c in _OF_PLACE_ALONE if is_near(c, t)}
+    near = {c: t for t in facts for c in _STATED_COLUMNS if is_near(c, t)}
     lines = {c: shown(t)[1:-1] for c, t in (near | {**block.not_taken}).items()}
     return others + references_not_taken(
         {c: t for c, t in lines.items() if c not in {*named, *stated}}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -264,9 +265,9 @@ def is_left_handed(axes: Sequence[str]) -> bool:
     >>> is_left_handed(("+y", "+x", "+z")), is_left_handed(("-y", "+x", "+z"))
     (True, False)
     """
-    letters = "".join(axis[1] for axis in axes)
-    odd = letters not in ("xyz", "yzx", "zxy")
-    return odd != ("".join(axes).count("-") % 2 == 1)
+    text = "".join(axes)
+    odd = text[1::2] not in ("xyz", "yzx", "zxy")
+    return odd != (text.count("-") % 2 == 1)
 
 
 def left_handed(axes: Mapping[str, Sequence[str]]) -> list[Finding]:
@@ -274,10 +275,12 @@ def left_handed(axes: Mapping[str, Sequence[str]]) -> list[Finding]:
 
     Not on an accelerometer whose channels all read opposite to those of the magnetometer: positive upwards, as many do.
     """
-    triads = [kind for kind, each in axes.items() if is_left_handed(each)]
+    triads = [*compress(axes, map(is_left_handed, axes.values()))]
+    if not triads:
+        return []
     others = [kind for kind in axes if kind not in triads]
     opposite = [tuple(axis.translate(_OTHER_SIGN) for axis in axes[kind]) for kind in triads]
-    if not triads or (others and opposite == [tuple(axes[others[0]])]):
+    if others and opposite == [tuple(axes[others[0]])]:
         return []
     reason = (
         f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read roll "
@@ -346,8 +349,9 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield from _undetermined(fitted)
     yield from _prior(fitted)
     yield from _model(fitted)
-    triads = zip(TRIADS, fitted.result.problem.triads, strict=False)
-    axes = {name: getattr(fitted.profile, name).axes for name, _ in triads}
+    profile, count = fitted.profile, len(fitted.result.problem.triads)
+    both = [profile.accelerometer.axes, profile.magnetometer.axes]
+    axes = dict(zip(TRIADS, both[:count], strict=False))
     for each in [*left_handed(axes), *of_table(fitted.readings)]:
         yield _common(fitted, each.id, each.text, range(fitted.count))
     yield from _culprits(fitted)

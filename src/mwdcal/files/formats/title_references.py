@@ -389,11 +389,9 @@ def stated_above(
         values[column] = _of_the_stand(column, values[column], here)
     references = _only(values)
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
-    if "declination_deg" not in block.metadata:
-        unread = [
-            ("declination_deg", line) for row in above if unread_declination(line := _line(row))
-        ]
-        rough |= dict(unread[:1])
+    unread = next(filter(unread_declination, map(_line, above)), "")
+    if unread and "declination_deg" not in block.metadata:
+        rough["declination_deg"] = unread
     choices = {c: tuple(each) for c, each in values.items() if len(each) > 1}
     metadata, others = {**references, **block.metadata}, _with_other_values(above, references)
     return block._replace(metadata=metadata, not_taken=rough, choices=choices, others=others)
