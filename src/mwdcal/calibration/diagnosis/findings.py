@@ -352,7 +352,8 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     profile, count = fitted.profile, len(fitted.result.problem.triads)
     both = [profile.accelerometer.axes, profile.magnetometer.axes]
     axes = dict(zip(TRIADS, both[:count], strict=False))
-    for each in [*left_handed(axes), *of_table(fitted.readings)]:
+    turned = both[:count].count(("+x", "+y", "+z")) < count
+    for each in [*(left_handed(axes) if turned else ()), *of_table(fitted.readings)]:
         yield _common(fitted, each.id, each.text, range(fitted.count))
     yield from _culprits(fitted)
     yield _distrusted(fitted)
