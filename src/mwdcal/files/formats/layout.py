@@ -1125,7 +1125,7 @@ def _blocks_above(sheet: Sheet, head: int, stated: Block, before: Sequence[Block
 
 
 def _facts(block: Block) -> Mapping[str, object]:
-    """What a title block says of the tool and the day; a day that may be read in two ways as it stands."""
+    """Facts of a title block on the tool and the day; a day that may be read in two ways as it stands."""
     facts = titles([row for _, row in block])
     return {**({"date": facts.unclear_day} if facts.unclear_day else {}), **facts.metadata}
 
@@ -1161,7 +1161,7 @@ class _Span(NamedTuple):
 
 
 def _titles_of(span: _Span, columns: Sequence[Cells], others: Block) -> Titles:
-    """What the title blocks of a table say, and the lines beside and below that are not the next one's.
+    """Facts of the title blocks of a table, and of the lines beside and below that are not the next one's.
 
     A block that states a day or a tool has no day of another one.
     """
