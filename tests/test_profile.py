@@ -487,6 +487,16 @@ def test_a_left_handed_triad_is_said_to_be_one(tmp_path):
     ran = mwdcal("profile", path, "-o", tmp_path / "tool.toml")
     assert ran.code == 0
     assert "left-handed" in ran.err
+    fitted = mwdcal("calibrate", path, "--tool", tmp_path / "tool.toml", "-o", tmp_path / "c.json")
+    assert "left-handed set" in fitted.err
+
+
+def test_two_columns_of_exchanged_angles_are_named(tmp_path):
+    run = servo_run(inclinations=(20, 60, 100))
+    one, other = "ref_azimuth_deg", "ref_toolface_deg"
+    path = write_csv(tmp_path / "run.csv", {**run, one: run[other], other: run[one]})
+    ran = mwdcal("profile", path, "-o", tmp_path / "tool.toml")
+    assert f"They fit with {one} and {other} exchanged" in ran.err, ran
 
 
 # -------------------------------------------------------------------------- names and files

@@ -145,6 +145,7 @@ class Records:
             profile=rounded(choice.profile),
             profile_sha256=readings.profile_sha256,
             run=readings.source,
+            sheet=readings.sheet or msgspec.UNSET,
             run_sha256=readings.run_sha256,
             prior_sha256=options.prior_sha256 or msgspec.UNSET,
             settings_file=readings.settings_source[0] or msgspec.UNSET,

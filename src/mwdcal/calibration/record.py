@@ -596,6 +596,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
     profile: Profile
     profile_sha256: str
     run: str
+    sheet: str | msgspec.UnsetType = msgspec.UNSET
     run_sha256: str
     prior_sha256: str | msgspec.UnsetType = msgspec.UNSET
     settings_file: str | msgspec.UnsetType = msgspec.UNSET
@@ -736,8 +737,8 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def run_name(self) -> str:
-        """The name of the run in messages: its file, if it had one."""
-        return self.run or UNNAMED
+        """The name of the run in messages: its file, if it had one, and its sheet."""
+        return f"{self.run}, sheet '{self.sheet}'" if self.sheet else self.run or UNNAMED
 
     @property
     def tool_name(self) -> str:

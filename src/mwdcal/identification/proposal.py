@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import groupby, permutations, product
+from itertools import combinations, groupby, permutations, product
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +19,8 @@ import numpy as np
 
 from mwdcal.calibration.diagnosis.findings import (
     MARKED_ROWS,
+    is_left_handed,
+    left_handed,
     magnetometer_absent,
     references_not_taken,
     unused_columns,
@@ -28,6 +30,7 @@ from mwdcal.calibration.diagnosis.refusals import MOTION_RANGE
 from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Finding
 from mwdcal.errors import Answer, FitError, InputError, QuestionError, QuestionsError
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.files.contract import (
     CHANNELS,
     MAPPED,
@@ -80,6 +83,7 @@ from mwdcal.identification.columns import (
     in_units,
     is_computed,
     is_filler,
+    is_near,
     is_not_of_tool,
     is_of_surroundings,
     is_of_tool,
@@ -1025,7 +1029,7 @@ def _wired(
         _check_sense(run, readings, scaled, columns)
     inclination = columns.get(REFERENCES["inclination"].column)
     elevated = bool(wirings and inclination and inclination.unit == ABOVE)
-    if inclination and elevated and all(map(_is_left_handed, wirings.values())):
+    if inclination and elevated and all(is_left_handed(each.axes) for each in wirings.values()):
         below = {
             **columns,
             REFERENCES["inclination"].column: ColumnSource(name=inclination.name, unit=BELOW),
@@ -1299,7 +1303,8 @@ def _check_dip(table: Table, profile: Profile, answers: Collection[str]) -> None
         where = shown(named.name) if named else "a line above the table"
         raise QuestionError(
             f"{table.source}: by the readings the dip is {seen:.1f}°, and by {where} {stated:.1f}°. Is the latter that "
-            "of another place or sign?",
+            "of another place or sign? Correct a wrong sign in the table; a blank answer leaves the dip out, and the "
+            "calibration finds it.",
             [
                 Answer(
                     "yes, leave it out: the calibration finds the dip", (("column", f"{column}="),)
@@ -1365,11 +1370,6 @@ def _check_tools(
         f"({listed(texts, len(texts))}) as those of several tools do. Which one is meant?",
         [*tools, Answer("all are of one tool", (("keep", f"{name}={texts[0]}"),))],
     )
-
-
-def _is_left_handed(result: Wiring) -> bool:
-    permutation = TriadProfile(axes=result.axes).permutation  # type: ignore[arg-type]
-    return bool(np.linalg.det(permutation) < 0)
 
 
 def as_written(
@@ -1484,12 +1484,25 @@ def _wirings(
         if is_clear(result):
             results[kind] = result
             _check_independent(readings, results)
-        elif len(result.alternatives) == 1 or result.unexplained > UNRELATED:
-            raise FitError(f"{run.source}: {_unexplained(kind, result)}")
-        else:
-            reason = "the stations do not tell the axes apart"
-            open_axes[kind] = OpenAxes(reason, result.alternatives, scale)
+            continue
+        pair = " and ".join(_exchanged_angles(kind, raw, readings, whole))
+        remedy = f" They fit with {pair} exchanged: exchange them by `column`." if pair else ""
+        if len(result.alternatives) == 1 or result.unexplained > UNRELATED:
+            raise FitError(f"{run.source}: {_unexplained(kind, result)}{remedy}")
+        reason = f"the stations do not tell the axes apart.{remedy}".removesuffix(".")
+        open_axes[kind] = OpenAxes(reason, [] if pair else result.alternatives, scale)
     return results, open_axes
+
+
+def _exchanged_angles(kind: str, raw: Array, readings: Readings, whole: Bools) -> tuple[str, ...]:
+    """The columns of two angles of the stand that would tell the axes of a triad if they were exchanged; else none."""
+    pairs = []
+    for one, other in combinations(ANGLES, 2):
+        known = {one: readings.reference(other), other: readings.reference(one)}
+        exchanged = replace(readings, known={**readings.known, **known})
+        if is_clear(wiring(raw, *_parts(kind, exchanged, whole))):
+            pairs.append((REFERENCES[one].column, REFERENCES[other].column))
+    return pairs[0] if len(pairs) == 1 else ()
 
 
 def _check_gravity(readings: Readings, columns: Mapping[str, ColumnSource]) -> None:
@@ -1552,7 +1565,9 @@ def _check_sense(
     except FitError:
         return
     sound = len(wirings) == len(TRIADS) and not open_axes
-    if sound and not all(map(_is_left_handed, wirings.values())):  # else another angle is turned
+    if sound and not all(
+        is_left_handed(each.axes) for each in wirings.values()
+    ):  # else another angle is turned
         raise QuestionError(
             f"{run.source}: the readings fit only if {shown(source.name)} counts anticlockwise looking down the hole. "
             "Does it?",
@@ -1632,35 +1647,9 @@ def _alternatives(axes: OpenAxes) -> str:
     return f": {named}{f' or {more} others' if more > 0 else ''}"
 
 
-def left_handed(proposal: Proposal) -> list[Finding]:
-    """A finding on triads whose channels x, y, z are a left-handed set by the axes proposed.
-
-    Not on an accelerometer whose channels all read opposite to those of the magnetometer: positive upwards, as many do.
-    """
-    triads = [kind for kind, result in proposal.wirings.items() if _is_left_handed(result)]
-    others = [kind for kind in proposal.wirings if kind not in triads]
-    reversed_axes = [
-        tuple(axis.translate(_OTHER_SIGN) for axis in proposal.wirings[kind].axes)
-        for kind in triads
-    ]
-    if not triads or (others and reversed_axes == [proposal.wirings[others[0]].axes]):
-        return []
-    reason = (
-        f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read roll "
-        "test and surveys with the same wiring"
-        if others
-        else "a reference angle counts the other way: toolface anticlockwise, or inclination from below"
-    )
-    return [
-        Finding(
-            id="left-handed",
-            text=f"{' and '.join(triads)}: by the axes proposed the channels x, y, z are a left-handed set. If the "
-            f"tool is not built so, {reason}.",
-        )
-    ]
-
-
-_OTHER_SIGN = str.maketrans("+-", "-+")
+_FACT = re.compile(r"\D{3,40}\d+([.,]\d+)*\W*([^\W\d_]\S{0,5})?\W*")
+"""A line of a few words, a number and perhaps its unit."""
+_STATED_COLUMNS = tuple(REFERENCES[name].column for name in STATED_REFERENCES)
 
 
 def lines_not_taken(proposal: Proposal) -> list[Finding]:
@@ -1682,8 +1671,12 @@ def lines_not_taken(proposal: Proposal) -> list[Finding]:
         for column, (line, other) in block.others.items()
         if column in stated and not (column in named and named[column].name in proposal.where.names)
     ]
-    lines = {c: shown(t)[1:-1] for c, t in block.not_taken.items() if c not in {*named, *stated}}
-    return others + references_not_taken(lines)
+    facts = (text for text in proposal.where.above if _FACT.fullmatch(text))
+    near = {c: t for t in facts for c in _STATED_COLUMNS if is_near(c, t)}
+    lines = {c: shown(t)[1:-1] for c, t in (near | {**block.not_taken}).items()}
+    return others + references_not_taken(
+        {c: t for c, t in lines.items() if c not in {*named, *stated}}
+    )
 
 
 def answers_by_readings(proposal: Proposal) -> list[Finding]:
@@ -1779,7 +1772,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         of_surveys(proposal)
         + one_inclination(proposal)
         + axes_open(proposal)
-        + left_handed(proposal)
+        + left_handed({kind: each.axes for kind, each in proposal.wirings.items()})
         + lines_not_taken(proposal)
         + marked
     )

@@ -90,6 +90,7 @@ class CalibrationSummary(msgspec.Struct, frozen=True, kw_only=True):
     """The output of `calibrate`: fields of `Calibration`, accuracy, comparisons, and the files written."""
 
     run: str
+    sheet: str | msgspec.UnsetType = msgspec.UNSET
     stations: int
     excluded: list[str]
     temperature_c: tuple[float, float] | None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -257,6 +258,47 @@ def references_not_taken(lines: Mapping[str, str]) -> list[Finding]:
     ]
 
 
+_OTHER_SIGN = str.maketrans("+-", "-+")
+
+
+def is_left_handed(axes: Sequence[str]) -> bool:
+    """Whether the `axes` of a triad make a left-handed set of its channels x, y, z.
+
+    >>> is_left_handed(("+y", "+x", "+z")), is_left_handed(("-y", "+x", "+z"))
+    (True, False)
+    """
+    text = "".join(axes)
+    odd = text[1::2] not in ("xyz", "yzx", "zxy")
+    return odd != (text.count("-") % 2 == 1)
+
+
+def left_handed(axes: Mapping[str, Sequence[str]]) -> list[Finding]:
+    """A finding on triads whose channels x, y, z are a left-handed set by their axes.
+
+    Not on an accelerometer whose channels all read opposite to those of the magnetometer: positive upwards, as many do.
+    """
+    triads = [*compress(axes, map(is_left_handed, axes.values()))]
+    if not triads:
+        return []
+    others = [kind for kind in axes if kind not in triads]
+    opposite = [tuple(axis.translate(_OTHER_SIGN) for axis in axes[kind]) for kind in triads]
+    if others and opposite == [tuple(axes[others[0]])]:
+        return []
+    reason = (
+        f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read roll "
+        "test and surveys with the same wiring"
+        if others
+        else "a reference angle counts the other way: toolface anticlockwise, or inclination from below"
+    )
+    return [
+        Finding(
+            id="left-handed",
+            text=f"{' and '.join(triads)}: by the `axes` of the profile the channels x, y, z are a left-handed set. If "
+            f"the tool is not built so, {reason}.",
+        )
+    ]
+
+
 def magnetometer_absent(references: Iterable[str]) -> list[Finding]:
     """A finding on references of the field that a table states which has no magnetometers."""
     stated = " and ".join(sorted({*references} & {"field", "dip"}, reverse=True))
@@ -309,7 +351,11 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     yield from _undetermined(fitted)
     yield from _prior(fitted)
     yield from _model(fitted)
-    for each in of_table(fitted.readings):
+    profile, count = fitted.profile, len(fitted.result.problem.triads)
+    both = [profile.accelerometer.axes, profile.magnetometer.axes]
+    axes = dict(zip(TRIADS, both[:count], strict=False))
+    turned = both[:count].count(("+x", "+y", "+z")) < count
+    for each in [*(left_handed(axes) if turned else ()), *of_table(fitted.readings)]:
         yield _common(fitted, each.id, each.text, range(fitted.count))
     yield from _culprits(fitted)
     yield _distrusted(fitted)

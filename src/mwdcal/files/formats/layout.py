@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise, zip_longest
 from operator import eq
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -195,6 +195,8 @@ _SAME_WARMTH = 10.0
 """By how much a temperature differs at most from the one that its sheet is named by."""
 
 Cells = Sequence[object]
+Block = list[tuple[int, Cells]]
+"""The rows of a title block, by number."""
 
 
 class Sheet(NamedTuple):
@@ -284,6 +286,8 @@ def laid_out(
     if not tables:
         raise _no_table(source, header_line, wanted, every)
     best = max(tables, key=lambda layout: layout.size)
+    if not kind and not header_line:
+        _check_renamed(best, [t for t in every if t not in tables], source, wanted)
     alike = _alike_among(tables, best)
     if len(alike) > 1 and not header_line and not kind:
         run = _the_run(alike)
@@ -629,31 +633,38 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
     """A table with what sheets without readings say, where its own title block does not."""
     words = " ".join([*layout.above, *(_text(row) for each in covers for _, row in each.rows[:1])])
     blocks = [stated_above([row for _, row in sheet.rows], (), words) for sheet in covers]
-    stated = {key: value for block in blocks[::-1] for key, value in block.metadata.items()}
-    block = layout.titles
-    day = block.unclear_day or next((b.unclear_day for b in blocks if b.unclear_day), "")
-    metadata = {**stated, **block.metadata}
-    not_taken = {c: line for b in [*blocks[::-1], block] for c, line in b.not_taken.items()}
-    choices = {c: each for b in [*blocks[::-1], block] for c, each in b.choices.items()}
-    others = {c: line for b in [*blocks[::-1], block] for c, line in b.others.items()}
-    whole = Titles(metadata, "" if "date" in metadata else day, not_taken, choices, others)
-    return replace(layout, titles=whole if blocks else block)
+    return replace(layout, titles=_completed(layout.titles, blocks))
+
+
+def _completed(block: Titles, others: Iterable[Titles]) -> Titles:
+    """A title block with what others state of that which it leaves open, the nearest first."""
+    for other in others:
+        stated = {*block.metadata, *block.choices}
+        metadata = {k: v for k, v in other.metadata.items() if k not in stated} | {**block.metadata}
+        day = "" if "date" in metadata else block.unclear_day or other.unclear_day
+        whole: list[dict[str, Any]] = [
+            {k: v for k, v in theirs.items() if k not in stated} | {**ours}
+            for theirs, ours in zip(other[2:], block[2:], strict=True)
+        ]
+        block = Titles(metadata, day, *whole)
+    return block
 
 
 def _alike_among(tables: Sequence[Layout], best: Layout) -> list[Layout]:
     """The tables that may be meant as well as the largest, `best`: those of some size, or all that are one run."""
-    alike = [t for t in tables if t is best or _alike(t, best)]
+    alike = [
+        t for t in tables if t is best or _share_columns(t, best) or _are_of_one_triad_each(t, best)
+    ]
     runs = [t for t in alike if not _kind_of(t)]
     if len(runs) > 1 and _is_one_run(runs):
         return alike
     return [t for t in alike if t is best or len(t.lines) >= _BESIDES]
 
 
-def _alike(one: Layout, other: Layout) -> bool:
-    """Whether two tables share most of their columns, in whatever spelling, or are of one triad each."""
+def _share_columns(one: Layout, other: Layout) -> bool:
+    """Whether two tables share most of their columns, in whatever spelling."""
     ours, theirs = ({*_spelling(each.names)} for each in (one, other))
-    most = len(ours & theirs) >= _SHARED * max(len(ours), len(theirs))
-    return most or _are_of_one_triad_each(one, other)
+    return len(ours & theirs) >= _SHARED * max(len(ours), len(theirs))
 
 
 def _no_table(
@@ -678,16 +689,42 @@ def _no_table(
     )
 
 
+def _check_renamed(
+    table: Layout, others: Sequence[Layout], source: str, wanted: Collection[str]
+) -> None:
+    """Refuse a table as the run where one of the `others` is like it but for names of columns that are `wanted`."""
+    for other in (t for t in others if not _kind_of(t) and len(t.lines) >= _BESIDES):
+        if not _share_columns(other, table):
+            continue
+        absent = [shown(name) for name in wanted if name not in other.names]
+        columns = "column" if len(absent) == 1 else "columns"
+        on_sheets = other.sheet != table.sheet
+        here, there = (
+            f"sheet {shown(t.sheet)}" if on_sheets else f"the table in row {t.form.header_line}"
+            for t in (other, table)
+        )
+        problem = f"{source}: {here} has no {columns} {', '.join(absent)}"
+        advice = "correct its names in the table or in [columns] of the tool profile"
+        if kind := _kind_of(table):
+            raise InputError(f"{problem}; {there} has, and is a {kind}.")
+        key = f'sheet = "{table.sheet}"' if on_sheets else f"header_line = {table.form.header_line}"
+        text = f"{problem}; {there} has. If {here} is the run, {advice}; if {there} is, put {key} into its [table]."
+        raise QuestionError(text, [])
+
+
 def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError:
     places = [
         f"{f'sheet {shown(t.sheet)}, ' if t.sheet else ''}row {t.form.header_line} ({len(t.lines)} rows)"
         for t in sorted(tables, key=lambda t: (t.sheet, t.form.header_line))
     ]
-    by_sheet = len({t.sheet for t in tables}) == len(tables) and not sheet
+    counts = Counter(t.sheet for t in tables)
     answers = [
         Answer(
             f"{shown(t.sheet) if t.sheet else 'row'} {t.form.header_line}, {len(t.lines)} rows",
-            (("sheet", t.sheet) if by_sheet else ("header_row", str(t.form.header_line)),),
+            (
+                *[("sheet", t.sheet)] * (len(counts) > 1 and not sheet),
+                *[("header_row", str(t.form.header_line))] * (counts[t.sheet] > 1),
+            ),
         )
         for t in tables
     ]
@@ -706,8 +743,7 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
     without = [row for row in rows[names:] if _is_without_reading(row[1])]
     aside = {line for line, _ in [*remarks, *without]}
     stated = [row for row in remarks if titles([row[1]]).metadata]
-    rows = [*stated, *(row for row in rows if row[0] not in aside)]
-    rows = _with_legend(rows)
+    rows = _with_legend([row for row in rows if row[0] not in aside])
     sheet = sheet._replace(rows=rows)
     readings = [_is_reading(row) for _, row in rows]
     heads = [
@@ -716,25 +752,30 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
         if below and not now and (_texts(rows[k][1]) >= LEAST_COLUMNS or _is_below_names(rows, k))
     ]
     heads = [k for n, k in enumerate(heads) if n == 0 or _begins_anew(rows, heads[:n], k)]
-    for head, end in pairwise([*heads, len(rows)]):
-        if layout := _table(sheet, head, end, source, decimal):
+    blocks: list[list[Block]] = [[]]
+    for head in heads:
+        blocks.append(_blocks_above(sheet, head, stated, blocks[-1]))
+    spans = pairwise([*heads, len(rows)])
+    behind = [*blocks[2:], list[Block]([[]])]
+    for (head, end), above, below in zip(spans, blocks[1:], behind, strict=False):
+        if layout := _table(sheet, _Span(head, end, above, below[0]), source, decimal):
             last = rows[end][0] if end < len(rows) else math.inf
-            below = [row for row in remarks if rows[head][0] < row[0] < layout.lines[0]]
+            under = [row for row in remarks if rows[head][0] < row[0] < layout.lines[0]]
             void = [(n, _words(row)) for n, row in without if rows[head][0] < n < last]
             layout = replace(
                 layout,
                 left_out=tuple(sorted([*layout.left_out, *void])),
-                above=(*layout.above, *(" ".join(map(as_text, row)).strip() for _, row in below)),
+                above=(*layout.above, *(" ".join(map(as_text, row)).strip() for _, row in under)),
             )
-            between = [*below, *rows[head + 1 : end]]
-            above = rows[max(0, head - 4) : head]
-            layout = _with_settings(_with_warmth_of_lines(layout, between), [*above, *between])
-            layout = _with_serials(layout, [*above, *between])
+            between = [*under, *rows[head + 1 : end]]
+            near = [*rows[max(0, head - 4) : head], *between]
+            layout = _with_settings(_with_warmth_of_lines(layout, between), near)
+            layout = _with_serials(layout, near)
             yield _with_triads_beside(_with_triad_above(_with_rows_of_headings(layout)))
 
 
 def _with_side_blocks_above(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
-    """The rows, in which a title block to the left or right of the table is moved above it.
+    """The rows, in which a title block to the left or right of a table is moved above it.
 
     Such a block is of two columns or more behind or before a blank one, each filled in beside less than half of the
     readings, and says something of the tool, the day or the place.
@@ -743,19 +784,31 @@ def _with_side_blocks_above(rows: list[tuple[int, Cells]]) -> list[tuple[int, Ce
     first = max(readings[0] - 1, 0) if readings else len(rows)
     inside = [row for _, row in rows[first : readings[-1] + 1]] if readings else []
     counts = [sum(c != "" for c in column) for column in zip_longest(*inside, fillvalue="")]
-    above: list[tuple[int, Cells]] = []
+    starts = _starts(rows, readings)
+    above: dict[int, Block] = {start: [] for start in starts}
     for filled, each in groupby(range(len(counts)), key=lambda k: counts[k] > 0):
         block = [*each]
         if not filled or len(block) < 2 or 2 * max(counts[k] for k in block) >= len(readings):
             continue
-        stated = [(-1, [row[k] for k in block if k < len(row)]) for _, row in rows[first:]]
-        table = any(_is_reading(row) for _, row in stated)
-        if not table and stated_above([row for _, row in stated]).metadata:
-            above += [each for each in stated if any(each[1])]
+        stated = [[row[k] for k in block if k < len(row)] for _, row in rows[first:]]
+        if not any(map(_is_reading, stated)) and stated_above(stated).metadata:
+            for place, row in enumerate(stated, first):
+                above[max(s for s in starts if s <= place)] += [(-1, row)] * any(row)
             rows = rows[:first] + [
                 (n, ["" if k in block else c for k, c in enumerate(row)]) for n, row in rows[first:]
             ]
-    return above + [row for row in rows if any(cell != "" for cell in row[1])]
+    parts = pairwise([*starts, len(rows)])
+    whole = [row for start, end in parts for row in [*above[start], *rows[start:end]]]
+    return [row for row in whole if any(cell != "" for cell in row[1])]
+
+
+def _starts(rows: Sequence[tuple[int, Cells]], readings: Sequence[int]) -> list[int]:
+    """The places right below each table with names below it, and the first place of all."""
+    return [0] + [
+        one + 1
+        for one, other in pairwise(readings)
+        if any(_is_of_texts(row) for _, row in rows[one + 1 : other])
+    ]
 
 
 _DITTO = re.compile(
@@ -985,11 +1038,19 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     first = _triads_in(" ".join(_text(row) for _, row in rows[max(0, heads[-1] - 1) : heads[-1]]))
     if first and _triads_in(" ".join(between[1:])) - first:
         return True
-    ours, theirs = (
-        {tool for _, row in part if not _is_reading(row) and (tool := tool_in(row))}
-        for part in (rows[: heads[0]], rows[heads[-1] : place])
-    )
-    return bool(theirs - ours)
+    block = [row for row in rows[heads[-1] : place] if not _is_reading(row[1])]
+    facts = _facts(block)
+    day = _facts([row for row in rows[: heads[-1]] if not _is_reading(row[1])]).get("date")
+    if "serial" in facts and facts.get("date", day) != day:
+        return True
+    stated = [_tools_in(rows[start:end]) for start, end in pairwise([0, *heads])]
+    ours = next(filter(None, stated[::-1]), set())
+    return bool(_tools_in(block) - ours)
+
+
+def _tools_in(rows: Sequence[tuple[int, Cells]]) -> set[str]:
+    """The tools that lines among readings state."""
+    return {tool for _, row in rows if not _is_reading(row) and (tool := tool_in(row))}
 
 
 def _repeats(row: Cells, rows: Sequence[tuple[int, Cells]], head: int) -> bool:
@@ -1042,11 +1103,98 @@ def _is_without_reading(row: Cells) -> bool:
     return lacking >= LEAST_COLUMNS - 1 and alone
 
 
-def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layout | None:
-    """The table whose last row of names, or of units, is at a place, down to the row before `end`."""
+def _blocks_above(sheet: Sheet, head: int, stated: Block, before: Sequence[Block]) -> list[Block]:
+    """The title blocks of the table whose last row of names, or of units, is at a place, its own first.
+
+    That is what stands between the table before it and its names, with what is `stated` below these. The blocks
+    `before` hold for it too; of another tool, only the cover of all tables does.
+    """
     rows = sheet.rows
-    names, units, top = _head(rows, head, sheet.merged)
-    above = [row for _, row in rows[:top]]
+    top = _head(rows, head, sheet.merged)[2]
+    first = 0
+    if before:
+        first = next((k for k in range(top, 0, -1) if _is_reading(rows[k - 1][1])), 0)
+    start, end = (rows[first - 1][0] if first else -math.inf), rows[head + 1][0]
+    above = _without_footer(rows[first:top], start)
+    block = [*(row for row in stated if start < row[0] < end), *above]
+    serial, known = (
+        next(filter(None, (_facts(each).get("serial") for each in every)), None)
+        for every in ([block], before)
+    )
+    return [block, *([_cover(before[-1])] if before and serial not in (None, known) else before)]
+
+
+def _facts(block: Block) -> Mapping[str, object]:
+    """Facts of a title block on the tool and the day; a day that may be read in two ways as it stands."""
+    facts = titles([row for _, row in block])
+    return {**({"date": facts.unclear_day} if facts.unclear_day else {}), **facts.metadata}
+
+
+def _in_paragraphs(block: Block) -> list[Block]:
+    """The rows of a title block, apart where a blank row is between them."""
+    parts: list[Block] = []
+    for row in block:
+        if parts and row[0] - parts[-1][-1][0] <= 1:
+            parts[-1].append(row)
+        else:
+            parts.append([row])
+    return parts
+
+
+def _cover(block: Block) -> Block:
+    """The paragraphs above a first table that hold for all: those before the first that states a tool or a day."""
+    cover: Block = []
+    for part in _in_paragraphs(block)[:-1]:
+        if {"serial", "date"} & {*_facts(part)}:
+            break
+        cover += part
+    return cover
+
+
+class _Span(NamedTuple):
+    """A table among rows: the places of its head and its end, its title blocks, its own first, and that of the next."""
+
+    head: int
+    end: int
+    blocks: Sequence[Block]
+    next_block: Block
+
+
+def _titles_of(span: _Span, columns: Sequence[Cells], others: Block) -> Titles:
+    """Facts of the title blocks of a table, and of the lines beside and below that are not the next one's.
+
+    A block that states a day or a tool has no day of another one.
+    """
+    first, *above = ([row for _, row in block] for block in span.blocks)
+    following = span.next_block if _facts(span.next_block) else []
+    apart = {line for line, _ in following}
+    stated = stated_above(first, _beside(columns, [row for row in others if row[0] not in apart]))
+    every = [*map(stated_above, above)]
+    if stated.unclear_day or "serial" in stated.metadata:
+        every = [
+            t._replace(
+                metadata={k: v for k, v in t.metadata.items() if k != "date"}, unclear_day=""
+            )
+            for t in every
+        ]
+    return _completed(stated, every)
+
+
+def _without_footer(block: Block, line: float) -> Block:
+    """The rows below a table without the paragraph right below its last `line`, where a later one states as much."""
+    foot = next(iter(_in_paragraphs(block)), [])
+    if not foot or foot[0][0] != line + 1:
+        return block
+    rest = block[len(foot) :]
+    ours, theirs = ({"serial", "date"} & {*_facts(each)} for each in (foot, rest))
+    return block if not theirs or ours - theirs == {"serial"} else rest
+
+
+def _table(sheet: Sheet, span: _Span, source: str, decimal: str) -> Layout | None:
+    """The table whose last row of names, or of units, is at the head of a span, down to the row before its end."""
+    rows, (head, end, blocks, _) = sheet.rows, span
+    names, units, _ = _head(rows, head, sheet.merged)
+    above = [row for block in blocks[::-1] for _, row in block]
     below = rows[_another_part(rows, head, end) : end]
     end -= len(below)
     kept = _without_summary([row for row in rows[head + 1 : end] if _is_reading(row[1])])
@@ -1058,7 +1206,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
     names, units, columns, letters = _apart(*_used(kept, names, units, sheet.first_column))
     names, units, columns = _in_degrees(names, units, columns, " ".join(map(_text, above)))
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
-    block = stated_above(above, _beside(columns, others))
+    block = _titles_of(span, columns, others)
     texts = [figures.as_they_stand(column) for column in columns]
     names, read = _read(names, columns, texts, sign)
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
@@ -1086,7 +1234,7 @@ def _table(sheet: Sheet, head: int, end: int, source: str, decimal: str) -> Layo
             n for n, column in zip(names, columns, strict=True) if any(map(_is_fraction, column))
         ),
         above=tuple(" ".join(map(as_text, row)).strip() for row in above),
-        heading=_words(above[-1]) if above and not _is_reading(above[-1]) else "",
+        heading=_words(blocks[0][-1][1]) if blocks[0] and not _is_reading(above[-1]) else "",
         titles=block._replace(metadata=dated(block.metadata, zip(names, texts, strict=True))),
         left_out=tuple(
             (line, _words(row)) for line, row in [*others, *below] if not _repeats(row, rows, head)

@@ -432,12 +432,16 @@ LEAVE_OUT = "leave such rows out by leave_out in [table] of the tool profile"
 
 def _advice(name: str, cell: str, decimal: str) -> str:
     """The remedy for a cell of the column `name` that is not a number."""
+    rows = f"leave_out = {{{shown(name)} = [{shown(cell)}]}}"
     if decimal == "." and looks_numeric(cell, ","):
         return "Is the decimal comma intended? Use `decimal` ','."
     if decimal == "," and looks_numeric(cell, "."):
         return "The decimal sign was given as a comma. Is the point intended? Use `decimal` '.'."
     if re.fullmatch(r"[+-]?(nan|inf|infinity|∞|n/?a|null|none)", cell, re.IGNORECASE):
-        return "Every number must be finite. Leave the cell blank where a value is unknown."
+        return (
+            f"Every number must be finite. Where a channel has no value, {LEAVE_OUT}: {rows}. "
+            "Leave the cell blank where another value is unknown."
+        )
     if re.fullmatch(r"[+-]?\d{1,3}([ ,.'’_\u00a0\u202f]\d{3})+([.,]\d*)?", cell):
         return "Write numbers without thousands separators."
     if re.match(r"0[xXbBoO]", cell):
@@ -445,7 +449,6 @@ def _advice(name: str, cell: str, decimal: str) -> str:
     behind = re.fullmatch(r"[+-]?[\d.,]+([eE][+-]?\d+)?\s*([^\d\s.,+-].*)", cell)
     if behind and (unit_of(behind[2]) or unit_of_length(behind[2])):
         return "Write the number without its unit; the column name states it."
-    rows = f"leave_out = {{{shown(name)} = [{shown(cell)}]}}"
     return f"Write a plain number, such as 0.998 or 9.98e-1, or {LEAVE_OUT}: {rows}."
 
 

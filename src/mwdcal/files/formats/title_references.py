@@ -18,7 +18,7 @@ from typing import NamedTuple
 from mwdcal.calibration.readings import EARTH_GRAVITY
 from mwdcal.files.formats.columns import as_text, looks_numeric, without_marks
 from mwdcal.files.formats.settings import LONGEST_STATEMENT, settings_in
-from mwdcal.files.formats.titles import Titles, titles
+from mwdcal.files.formats.titles import Titles, titles, unread_declination
 from mwdcal.files.synonyms import FACTORS, unit_of
 
 EARTH_FIELD = (15_000.0, 80_000.0)
@@ -389,6 +389,9 @@ def stated_above(
         values[column] = _of_the_stand(column, values[column], here)
     references = _only(values)
     rough = {c: text for c, text in doubtful_in(rows, besides).items() if c not in references}
+    unread = next(filter(unread_declination, map(_line, above)), "")
+    if unread and "declination_deg" not in block.metadata:
+        rough["declination_deg"] = unread
     choices = {c: tuple(each) for c, each in values.items() if len(each) > 1}
     metadata, others = {**references, **block.metadata}, _with_other_values(above, references)
     return block._replace(metadata=metadata, not_taken=rough, choices=choices, others=others)

@@ -171,20 +171,30 @@ _ENGLISH_DATE = re.compile(
 _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
+_SENSE = "[ew]|east|west|ouest|oeste?|vest|est|este|leste|ost|øst|öst|зап\\w*|вост\\w*"
 _TURN_EAST = (
     r"(?:\s+mag[^\W\d_]*)?(?:\s+(?:at|am|ved|en|in|on)\s+(?:the\s+)?[^\W\d_]+)?"
-    r"(?:\s*\((?P<note>[^)]*)\))?[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*)?"
+    rf"(?P<note>(?:[\s,;:]*(?:\([^)]*\)|\[[^\]]*\]|(?:deg\w*|grad\w*|gra[du][os]?s?|positive|{_SENSE})(?![^\W\d_])))*)"
+    r"[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*)?"
     r"(?:\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*(?:['′’]|min\w*))?\s*\(?(?P<sense>[EWO](?!\s*[+(])|west|зап|vest|oest)?"
 )
-_DECLINATION = re.compile(
-    r"((?:decl|dekl|décl)\w*|misvisning|склонени\w*|схилення|偏角|manyetik sapma|odchylenie magn\w*)"
-    + _TURN_EAST,
+_DECLINATION_WORD = re.compile(
+    r"((?:decl|dekl|décl)\w*|misvisning|склонени\w*|схилення|偏角|manyetik sapma|odchylenie magn\w*)",
     re.IGNORECASE,
 )
+_DECLINATION = re.compile(_DECLINATION_WORD.pattern + _TURN_EAST, re.IGNORECASE)
 _WEST_POSITIVE = re.compile(r"\b(w|west|ouest|oeste?|vest|зап\w*)\b\W*(\+|pos)", re.IGNORECASE)
 """A sense in brackets behind the word: (° W +)."""
-_WEST = re.compile(r"\W*(deg\w*)?\W*(w|west|ouest|oeste?|vest|зап\w*)\W*", re.IGNORECASE)
-"""The whole of such brackets: (W), (° west)."""
+_WEST = re.compile(
+    r"(\W*(deg\w*|grad\w*|gra[du][os]?s?))?\W*(w|west|ouest|oeste?|vest|зап\w*)(\W*(deg\w*|grad\w*|gra[du][os]?s?))?\W*",
+    re.IGNORECASE,
+)
+"""The whole of such words: (W), (° west), W [deg]."""
+_NO_DEGREES = re.compile(
+    r"(?<![^\W\d_])(m?rad|gon|min|arc\w*|sec|mils?|nt|[uµ]t|uncert\w*|\d?σ|sd|per|change|drift)(?![^\W\d_])|/|['′’%±]",
+    re.IGNORECASE,
+)
+"""Words behind a declination of another unit than degrees, or of another quantity."""
 _CONVERGENCE = re.compile(
     r"(convergence|konvergenz|meridiankonvergens|convergencia|сближение меридианов|收敛角)"
     + _TURN_EAST,
@@ -284,10 +294,25 @@ def _rotation(statement: re.Pattern[str], text: str) -> float | None:
     if abs(value) > 180:
         return None
     note, sense = match["note"] or "", match["sense"] or ""
+    if _NO_DEGREES.search(note):
+        return None
     if _WEST_POSITIVE.search(note):
         return -value
+    ost = sense.upper() == "O" and match[1].lower().startswith("dekl")
     west = sense.upper()[:1] in tuple("WOЗV") or _WEST.fullmatch(note)
-    return -abs(value) if west else value
+    return -abs(value) if west and not ost else value
+
+
+def unread_declination(text: str) -> bool:
+    """Whether a line speaks of a declination and has a number, which `titles` did not read.
+
+    >>> [unread_declination(text) for text in ("Declination [rad] 0.04", "Declination by IGRF13", "Dip 65.3")]
+    [True, False, False]
+    """
+    word = _DECLINATION_WORD.search(text)
+    return bool(
+        word and re.search(r"(?<![\w.,])[+−-]?\d+(?:[.,]\d+)?(?![\w-])", text[word.end() :])
+    )
 
 
 def _marked_in(text: str) -> list[str]:

@@ -1,0 +1,50 @@
+"""Declinations above a table: unit and sense behind the word, and lines that are not understood."""
+
+from __future__ import annotations
+
+import pytest
+
+from mwdcal.files.formats.title_references import stated_above
+from mwdcal.files.formats.titles import titles
+
+
+@pytest.mark.parametrize(
+    ("words", "number", "degrees"),
+    [
+        ("Declination [deg]", "2.40", 2.4),
+        ("Declination [degrees]", "2.40", 2.4),
+        ("Declination deg", "2.40", 2.4),
+        ("Declination, deg", "-2.40", -2.4),
+        ("Magnetic declination [deg]", "2.40", 2.4),
+        ("Declination E [deg]", "2.40", 2.4),
+        ("Declination E [deg]", "-2.40", -2.4),
+        ("Declination W [deg]", "2.40", -2.4),
+        ("Declination [deg W]", "2.40", -2.4),
+        ("Declination west (deg)", "2.40", -2.4),
+        ("Declination (east positive) [deg]", "-2.40", -2.4),
+        ("Declination [deg, W positive]", "2.40", -2.4),
+        ("Declination (west pier) [deg]", "2.40", 2.4),
+        ("Misvisning [grader]", "2,4", 2.4),
+        ("Deklination [Grad]", "2,4 O", 2.4),
+    ],
+)
+def test_a_declination_is_read_behind_its_unit_and_sense(
+    words: str, number: str, degrees: float
+) -> None:
+    assert titles([[words, number]]).metadata["declination_deg"] == pytest.approx(degrees)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Declination [deg] 240",
+        "Declination [rad] 0.04",
+        "Declination (min) 144",
+        "Declination σ 0.1",
+    ],
+)
+def test_a_declination_that_is_not_understood_is_listed(line: str) -> None:
+    """Nothing is read of it as degrees."""
+    block = stated_above([[line]])
+    assert "declination_deg" not in block.metadata
+    assert block.not_taken == {"declination_deg": line}

@@ -1,0 +1,128 @@
+"""Two runs in one file: each table has the serial, the day and the references of its own title block."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mwdcal.errors import InputError, QuestionError
+from mwdcal.files.formats import layout
+from mwdcal.files.formats import table as tables
+
+NAMES = "Inc,Azi,TF,Gx,Gy,Gz,Bx,By,Bz"
+FIRST = [f"{15 + k},{10 * k},{40 * k},0.1,0.2,0.9,1{k}00.5,{k}00.5,4836{k}.4" for k in range(9)]
+SECOND = [f"{16 + k},{10 * k},{40 * k},0.1,0.2,0.9,1{k}10.5,{k}10.5,4837{k}.4" for k in range(9)]
+A = ["Serial no.,DM-4471", "Date,2026-11-24"]
+FIELD = "Total field,49820,nT"
+
+
+def facts(folder: Path, *blocks: list[str]) -> list[tuple[object, ...]]:
+    """Serial, day and field strength of each table of a file, by the lines above each."""
+    path, rows = folder / "two.csv", [FIRST, SECOND, FIRST]
+    lines = [x for block, each in zip(blocks, rows, strict=False) for x in (*block, NAMES, *each)]
+    path.write_text("\n".join(lines) + "\n")
+    keys = ("serial", "date", "ref_field_nt")
+    return [tuple(t.titles.metadata.get(k) for k in keys) for t in tables.every_table(path)]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ([*A, FIELD], ["", "Serial no.,DM-4472", "Date,2026-11-25", "Total field,49790,nT"],
+         ("DM-4472", "2026-11-25", 49790.0)),
+        ([*A, FIELD], ["Serial no.,DM-4472", "Date,2026-11-25"], ("DM-4472", "2026-11-25", None)),
+        ([*A, FIELD], ["", "Serial no.,DM-4472"], ("DM-4472", None, None)),
+        (["Serial no.,DM-4471", "", "Date,2026-11-24", "", FIELD], ["", "Serial no.,DM-4472"],
+         ("DM-4472", None, None)),
+        (["Laboratory X", FIELD, "", *A, ""], ["", "Serial no.,DM-4472", "Date,2026-11-25", ""],
+         ("DM-4472", "2026-11-25", 49820.0)),
+        ([*A, FIELD], ["Date,2026-11-24", "", "Serial no.,DM-4472", "Date,2026-11-25"],
+         ("DM-4472", "2026-11-25", None)),
+        ([*A, FIELD], ["", "After adjustment", "Date,2026-11-25"], ("DM-4471", "2026-11-25", 49820.0)),
+        ([*A, FIELD], ["", *A[:1], "Date,2026-11-25"], ("DM-4471", "2026-11-25", 49820.0)),
+        ([*A, FIELD], ["", "Serial no.,DM-4472", "Date,03/04/2025"], ("DM-4472", None, None)),
+        (["Tool DM-4471, 24.11.2026", FIELD], ["", "Tool DM-4472, 25.11.2026"],
+         ("DM-4472", "2026-11-25", None)),
+    ],
+)  # fmt: skip
+def test_a_second_table_has_the_facts_of_its_own_block(
+    tmp_path: Path, first: list[str], second: list[str], expected: tuple[object, ...]
+) -> None:
+    """A cover of the file, apart by a blank line, holds for all tables; the block of another tool for none."""
+    one, two = facts(tmp_path, first, second)
+    assert one == ("DM-4471", "2026-11-24", 49820.0)
+    assert two == expected
+
+
+def test_a_third_table_without_a_block_is_of_the_tool_above_it(tmp_path: Path) -> None:
+    every = facts(
+        tmp_path, [*A, FIELD], ["", "Serial no.,DM-4472", "Date,2026-11-25"], ["", "Roll test"]
+    )
+    assert every[2][:2] == ("DM-4472", "2026-11-25")
+
+
+def test_a_tool_that_comes_back_has_a_table_of_its_own(tmp_path: Path) -> None:
+    again = ["", "Serial no.,DM-4471", "Date,2026-11-26"]
+    every = facts(tmp_path, [*A, FIELD], ["", "Serial no.,DM-4472", "Date,2026-11-25"], again)
+    assert [each[:2] for each in every][1:] == [
+        ("DM-4472", "2026-11-25"),
+        ("DM-4471", "2026-11-26"),
+    ]
+
+
+def test_readings_of_another_table_state_no_reference(tmp_path: Path) -> None:
+    """A strength of the channel Mz, with its unit in the name, is a reading."""
+    path, names = tmp_path / "two.csv", NAMES.replace("Bz", "Mz raw (nT)")
+    second = ["", "Serial no.,DM-4472", FIELD]
+    path.write_text("\n".join([*A, FIELD, names, *FIRST, *second, names, *SECOND]) + "\n")
+    for each in tables.every_table(path):
+        assert (each.titles.metadata["ref_field_nt"], each.titles.choices) == (49820.0, {})
+
+
+def sheet(name: str, channel: str = "Gx", count: int = 9, again: bool = False) -> layout.Sheet:
+    """A sheet of readings, with a table more below where they come `again`."""
+    rows = [
+        NAMES.replace("Gx", channel).split(","),
+        *([float(c) for c in x.split(",")] for x in FIRST[:count]),
+    ]
+    every = [*rows, ["Serial no.", "DM-4472"], *rows] if again else rows
+    return layout.Sheet(name, [*enumerate(every, 1)])
+
+
+WANTED = ("Gx", "Gy", "Gz", "Bx", "By", "Bz")
+
+
+def test_a_sheet_with_a_renamed_column_is_not_passed_over_for_another() -> None:
+    """An old sheet, or a roll test, is not the run because it still has all names."""
+    renamed = sheet("Positions", "Accel X")
+    with pytest.raises(
+        QuestionError, match=r"'Positions' has no column 'Gx'; sheet 'Positions 2024' has"
+    ):
+        layout.laid_out([renamed, sheet("Positions 2024")], "w.xlsx", wanted=WANTED)
+    with pytest.raises(
+        InputError, match="'Positions' has no column 'Gx'; sheet 'Roll test' has, and is a roll"
+    ):
+        layout.laid_out([renamed, sheet("Roll test")], "w.xlsx", wanted=WANTED)
+
+
+def test_a_sheet_of_another_name_or_the_one_that_is_named_is_read() -> None:
+    alone = layout.laid_out(
+        [sheet("Run 2025-03"), sheet("Roll test", count=8)], "w.xlsx", wanted=WANTED
+    )
+    assert alone.sheet == "Run 2025-03"
+    both = [sheet("Positions", "Accel X"), sheet("Positions 2024")]
+    assert (
+        layout.laid_out(both, "w.xlsx", sheet="Positions 2024", wanted=WANTED).sheet == both[1].name
+    )
+
+
+def test_tables_on_two_sheets_and_twice_on_one_are_told_apart() -> None:
+    with pytest.raises(QuestionError) as question:
+        layout.laid_out([sheet("A", again=True), sheet("B")], "w.xlsx")
+    answers = {each.arguments for each in question.value.answers}
+    assert (("sheet", "B"),) in answers
+    assert {
+        (("sheet", "A"), ("header_row", "1")),
+        (("sheet", "A"), ("header_row", "12")),
+    } <= answers
