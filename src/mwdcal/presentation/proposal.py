@@ -114,17 +114,15 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
         table(rows, ["triad", "axes", "nominal scale", "variation left", "by the next best axes"])
     )
     if output:
-        table_file, tool, result = map(
-            shell_word, map(str, (run, output, output.with_suffix(".json")))
-        )
-        command = f"mwdcal calibrate {table_file} --tool {tool} -o {result}"
-        command += f" --rolltest {table_file}" if has_roll_test else ""
+        files = map(str, (run, output, output.with_suffix(".json")))
+        table_file, tool, result = map(shell_word, files)
+        rolled = f" --rolltest {table_file}" if has_roll_test else ""
+        command = f"mwdcal calibrate {table_file} --tool {tool} -o {result}{rolled}"
         command += page_option(output.with_suffix(".html"))
         if depths_of_surveys(proposal):
-            command = f"mwdcal survey TOOL.json {table_file} -o well.csv"
-            command += page_option("well.html")
+            command = f"mwdcal survey TOOL.json {table_file} -o well.csv{page_option('well.html')}"
         else:
-            first = ["add stations at other inclinations"] if proposal.level else []
+            first = ["add stations at other inclinations"] * bool(proposal.level)
             first += [f"fill in the axes in {one_line(output)}"] if proposal.open_axes else []
             command = f"{', '.join(first)}, then {command}" if first else command
         exact = (
