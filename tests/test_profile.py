@@ -350,7 +350,7 @@ def test_a_cell_of_another_decimal_sign_is_named_and_its_row_left_out(tmp_path):
     message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
     assert "line 2" in message
     option = ["--leave-out", "temperature_c=25,5"]
-    assert " ".join(option).replace("temp", "'temp") + "'" in message
+    assert " ".join(option).replace("temp", '"temp') + '"' in message
     ran = mwdcal("profile", path, "-o", tmp_path / "tool.toml", *option)
     assert ran.code == 0
     assert "line 2 ('temperature_c': 25,5)" in ran.err
