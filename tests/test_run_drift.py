@@ -10,7 +10,12 @@ from msgspec.structs import replace as with_changes
 from scipy import special
 
 from cli_support import calibrated, mwdcal, servo_run, write_csv
-from mwdcal.calibration.automatic.drift import by_drift, chances, with_drift
+from mwdcal.calibration.automatic.drift import (
+    by_drift,
+    chances,
+    chances_without_drift,
+    with_drift,
+)
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.structure import shown_effects
 from mwdcal.calibration.estimate import fit
@@ -148,6 +153,38 @@ def test_a_drift_that_no_finding_names_is_on_the_screen_too():
         assert [line.endswith("does not foresee: field 31 ± 11 nT") for line in said] == [
             True
         ] * shown
+
+
+@pytest.mark.parametrize("practice", [None, "per-station"], ids=["exact", "per station"])
+def test_the_noise_beside_a_drift_leaves_s_at_one(practice):
+    """Three times the noise, at stations whose angles err by more than it: it is still near that of the simulation."""
+    readings, rng = runs(44, 30, field=45.0, offset=3e-4), np.random.default_rng(44)
+    if practice:
+        sd = {name: np.radians(0.02) for name in ("inclination", "azimuth", "toolface")}
+        known = {n: readings.known[n] + s * rng.normal(size=(30, COUNT)) for n, s in sd.items()}
+        readings = replace(readings, known=readings.known | known, sd=sd, settings=practice)
+    options, seen = Options(order=0), 0
+    for _, result in by_drift(fit(readings, options), options):
+        np.testing.assert_allclose(result.analysis.variance_factor, 1, atol=2e-3)
+        if all(name in drifts(result) for name in ("accelerometer-drift", "field-drift")):
+            np.testing.assert_allclose(np.median(result.noise, 0), [1e-4, 15.0], rtol=0.15)
+            seen += len(result.noise)
+    assert seen > 10
+
+
+def test_the_chance_of_a_drift_is_that_of_the_run_as_a_steady_one():
+    """As the decision had it, by noise that the fit without the drift has."""
+    readings, rng = runs(44, 30, offset=3e-4), np.random.default_rng(44)
+    sd = {name: np.radians(0.02) for name in ("inclination", "azimuth", "toolface")}
+    known = {n: readings.known[n] + s * rng.normal(size=(30, COUNT)) for n, s in sd.items()}
+    readings = replace(readings, known=readings.known | known, sd=sd, settings="per-station")
+    options = Options(order=0)
+    steady = fit(readings, options)
+    decided = chances(steady)[0]
+    for places, result in by_drift(steady, options):
+        if result.problem.walks:
+            later = chances_without_drift(result, options)
+            np.testing.assert_allclose(np.log(later), np.log(decided[places]), atol=0.01)
 
 
 def test_a_member_of_a_batch_drifts_as_it_does_alone():
