@@ -22,6 +22,7 @@ from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Drift, Finding
+from mwdcal.calibration.residuals import Residuals, error_rows
 from mwdcal.calibration.results import StatedCovariance, drifts
 from mwdcal.certificate.budget import budget
 from mwdcal.errors import FitError
@@ -185,6 +186,20 @@ def test_the_chance_of_a_drift_is_that_of_the_run_as_a_steady_one():
         if result.problem.walks:
             later = chances_without_drift(result, options)
             np.testing.assert_allclose(np.log(later), np.log(decided[places]), atol=0.01)
+
+
+def test_the_expected_errors_include_the_drift_that_corrected_readings_keep():
+    """Three times the noise: by noise and stand alone the ratios of most observables would be above 1.3."""
+    readings, options, rows = runs(45, 60, field=45.0, offset=3e-4), Options(order=0), []
+    for places, result in by_drift(fit(readings, options), options):
+        if all(name in drifts(result) for name in ("accelerometer-drift", "field-drift")):
+            raw = readings.accelerometer[places], readings.magnetometer[places]
+            rows += error_rows(Residuals(Readings(*raw, known=readings.known, sd={}), result))
+    assert len(rows) > 30
+    for each in zip(*rows, strict=True):
+        after, expected = np.transpose([(row.after, row.expected) for row in each])
+        ratio = np.sqrt(np.mean(after**2) / np.mean(expected**2))
+        assert ratio == pytest.approx(1.0, abs=0.1), each[0].observable
 
 
 def test_a_member_of_a_batch_drifts_as_it_does_alone():
