@@ -33,6 +33,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.vectors import earth_field, earth_gravity, tool_from_earth
 from mwdcal.planning.expected import expected
+from mwdcal.planning.planned import judged, with_tool
 from mwdcal.planning.plans import drifted, load_plan
 from mwdcal.presentation.calibration import remarks
 from mwdcal.sensor.profile import Profile, StandProfile, TriadProfile
@@ -154,6 +155,21 @@ def test_a_drift_that_no_finding_names_is_on_the_screen_too():
         assert [line.endswith("does not foresee: field 31 ± 11 nT") for line in said] == [
             True
         ] * shown
+
+
+def test_a_plan_by_a_calibration_whose_run_drifted_says_that_it_does_not_foresee_that():
+    plan, profile = load_plan("twelve-state"), load_profile("servo")[0]
+    steady, planned = expected(plan, profile), judged(plan, profile)
+    drift = Drift(name="field", change=31.0, standard_uncertainty=11.0, unit="nT")
+    for drifts_of_run, said in (
+        ([], []),
+        ([drift], ["field 31 nT (1σ 11 nT)"]),
+        ([with_changes(drift, declared=40.0)], []),
+    ):
+        result = with_tool(planned, with_changes(steady, drift=drifts_of_run))
+        texts = [each.text for each in result.findings if each.id == "drift-unforeseen"]
+        assert [f"seems to have drifted: {each}. A plan" in text
+                for each, text in zip(said, texts, strict=True)] == [True] * len(said)  # fmt: skip
 
 
 @pytest.mark.parametrize("practice", [None, "per-station"], ids=["exact", "per station"])
