@@ -554,6 +554,41 @@ def test_references_that_no_limit_judges_and_the_readings_contradict_are_named(
     assert "contradicted" not in ids(verify(record, wrong, judged))
 
 
+@pytest.mark.parametrize(
+    ("name", "shift", "size", "hint"),
+    [
+        ("azimuth", 180, "180°", "the opposite direction"),
+        ("azimuth", 12, "-12°", "another zero, north or sense"),
+        ("toolface", -90, "+90°", "another zero, north or sense"),
+        ("inclination", 8, "-8°", "another zero, north or sense"),
+    ],
+)
+def test_a_reference_that_is_wrong_at_all_toolfaces_is_named_and_no_harmonic(
+    record, name, shift, size, hint
+):
+    """Noise of a sound tool lies on both sides of half a turn: no jump of 360° is an error."""
+    right = roll(45, toolface=plan((45,))[2])
+    limits = Limits(name="e", error=Bounds(**{f"{name}_deg": 2.0}))
+    assert verify(record, right, limits).passed
+    wrong = msgspec_replace(right, known={**right.known, name: right.known[name] + shift * DEG})
+    result = verify(record, wrong, limits)
+    [row] = result.rows
+    assert row.value == pytest.approx(abs(shift), abs=0.2)
+    assert row.uncertainty < 0.1
+    assert max(row.harmonics) < 0.2
+    assert ids(result) == ["constant-error"]
+    text = next(f.text for f in result.findings if f.id == "constant-error")
+    assert text.startswith(f"error of {name}: every station is off by {size[:-1]}")
+    assert f"wrong by as much: {hint}? Correct it" in text
+
+
+def test_a_large_bias_is_no_wrong_reference(record):
+    """A hundred times the limit: its error changes sign over the turn."""
+    result = verify(record, roll(45, tool=knocked(nanotesla=12_000)), BOTH)
+    assert "constant-error" not in ids(result)
+    assert "roll-harmonics" in ids(result)
+
+
 def several(count, seed, size, record, toolfaces=12, sd=NOISE):
     """Roll sets of one direction at 45°, each a group, of a tool knocked across its axis: a run."""
     face = np.tile(np.arange(toolfaces) * 360 / toolfaces, count) * DEG

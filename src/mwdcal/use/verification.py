@@ -24,6 +24,7 @@ from mwdcal.calibration.record import (
     stated,
 )
 from mwdcal.errors import InputError
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, eigen
 from mwdcal.use.correction import UNKNOWN_TEMPERATURE
@@ -139,6 +140,10 @@ WEAK = 0.5
 """A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
 NAMED_HARMONIC = 3.0
 """Standard uncertainties above which a harmonic is named as a cause."""
+STRAIGHT_BACK = 180.0
+"""Error of an angle of the opposite direction, degrees."""
+EVEN = 2.0
+"""An error is the same over a turn where its mean is more than so many times its harmonics."""
 FIRST_HARMONIC = {
     "inclination": "a bias of the accelerometer across the tool axis, or it leans",
     "azimuth": "a bias across the tool axis of either triad, or it leans",
@@ -173,6 +178,8 @@ VERDICT_FINDINGS = {
     "the tool has an error that these toolfaces do not resolve.",
     "weak-test": "{row.name}: its 1σ of {size} is more than half of the limit: by this limit alone the "
     "test can hardly tell a good tool from a bad one. Average longer at each station, or take more toolfaces.",
+    "constant-error": "{row.name}: every station is off by {size}° alike, which no tool does. The reference {angle} is "
+    "most likely wrong by as much: {hint}? Correct it and verify again.",
     "roll-harmonics": "{row.name} over a turn of toolface: {causes}.",
 }
 
@@ -637,7 +644,9 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
     elif sd > WEAK * limit:
         size = f"{sd:.2g}{'' if row.unit == '°' else ' '}{row.unit}"
         findings.append(_finding("weak-test", row=row, size=size))
-    if causes := _causes(row, name, worst):
+    if off := list(_constant_error(row, name, worst)):
+        findings += off
+    elif causes := _causes(row, name, worst):
         findings.append(_finding("roll-harmonics", row=row, causes="; ".join(causes)))
     return _Judged(row, findings, remarks, overall.errors)
 
@@ -714,6 +723,21 @@ def _harmonics(worst: Statistic, factor: float) -> tuple[float, float] | None:
         return None
     first, second = (worst.curve.amplitudes * factor).tolist()
     return first, second
+
+
+def _constant_error(row: VerdictRow, name: str, worst: Statistic) -> Iterator[Finding]:
+    """That the error of a failed angle is the same over a turn, and larger than any tool's."""
+    if row.passed or row.harmonics is None or worst.curve is None or name not in ANGLES:
+        return
+    mean, most = (
+        float(np.degrees(worst.curve.coefficients[0])),
+        np.degrees(NO_ERROR_OF_A_TOOL[name]),
+    )
+    if row.two_sided and abs(mean) > max(most, EVEN * sum(row.harmonics)):
+        back = abs(abs(mean) - STRAIGHT_BACK) < most
+        size = f"{abs(mean):.3g}" if back else f"{mean:+.3g}"
+        hint = "the opposite direction" if back else "another zero, north or sense"
+        yield _finding("constant-error", row=row, angle=name, size=size, hint=hint)
 
 
 def _causes(row: VerdictRow, name: str, worst: Statistic) -> list[str]:
