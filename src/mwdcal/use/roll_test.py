@@ -929,8 +929,9 @@ class RollTest:
         """The values of a rolled set, their curve, and what their errors would be in other tests."""
         index = roll_set.index
         part = self._error(name)[index] if error else self._centred(name, index)
-        if turn := OBSERVABLES[name].period:
-            part = unrolled(part, turn)
+        if turn := OBSERVABLES[name].period:  # errors on both sides of half a turn are alike
+            line = unrolled(part, turn)
+            part = line if np.ptp(line) < turn / 4 else part
         noise, reference = self._noise(name)[index], self.reference_errors(name, roll_set, error)
         individual, together = reference.individual, reference.together
         if doubted and not roll_set.declared:

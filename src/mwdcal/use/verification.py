@@ -170,12 +170,12 @@ VERDICT_FINDINGS = {
     "too small by it: add toolfaces between them.",
     "little-scatter": "{title}: the readings scatter less about the curves than the {noise} noise explains (chance "
     "below {chance:g}). {stand}This noise is too large, readings are repeated, or stations apart in the table share "
-    "one setting of the stand (then give them one group: it is counted once). The 1σ rests on the {noise} noise.",
+    "one setting of the stand (then give them one group: it is counted once). The 1σ comes from the {noise} noise.",
     "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
     "error is counted both ways. State [stand] settings in the profile.",
     "not-smooth": "{title}: the readings leave a smooth curve over toolface by far more than their noise. So the raw "
-    "figure is judged, nothing is taken off it, and its 1σ rests on that scatter. A station was misread or moved, or "
-    "the tool has an error that these toolfaces do not resolve.",
+    "figure is judged with all its noise, and its 1σ comes from their scatter about that curve. A station was "
+    "misread or moved, or the tool has an error that these toolfaces do not resolve.",
     "weak-test": "{row.name}: its 1σ of {size} is more than half of the limit: by this limit alone the "
     "test can hardly tell a good tool from a bad one. Average longer at each station, or take more toolfaces.",
     "constant-error": "{row.name}: every station is off by {size}° alike, which no tool does. The reference {angle} is "
