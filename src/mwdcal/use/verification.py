@@ -142,7 +142,7 @@ NAMED_HARMONIC = 3.0
 """Standard uncertainties above which a harmonic is named as a cause."""
 STRAIGHT_BACK = 180.0
 """Error of an angle of the opposite direction, degrees."""
-EVEN = 2.0
+STEADY_OVER_TURN = 2.0
 """An error is the same over a turn where its mean is more than so many times its harmonics."""
 FIRST_HARMONIC = {
     "inclination": "a bias of the accelerometer across the tool axis, or it leans",
@@ -733,7 +733,7 @@ def _constant_error(row: VerdictRow, name: str, worst: Statistic) -> Iterator[Fi
         float(np.degrees(worst.curve.coefficients[0])),
         np.degrees(NO_ERROR_OF_A_TOOL[name]),
     )
-    if row.two_sided and abs(mean) > max(most, EVEN * sum(row.harmonics)):
+    if row.two_sided and abs(mean) > max(most, STEADY_OVER_TURN * sum(row.harmonics)):
         back = abs(abs(mean) - STRAIGHT_BACK) < most
         size = f"{abs(mean):.3g}" if back else f"{mean:+.3g}"
         hint = "the opposite direction" if back else "another zero, north or sense"
