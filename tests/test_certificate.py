@@ -483,9 +483,9 @@ def test_a_raw_figure_is_marked_and_has_no_uncertainty_beyond_its_limit(servo):
     page = presented.render_page(paper)
     assert "± 7.6°" in page
     assert page.count("1.30° raw") == 2
-    assert "Marked raw" in page
+    assert "A value marked raw is judged with its noise" in page
     usual = issued(servo, verification=verification(servo, smooth))
-    assert "Marked raw" not in presented.render_page(usual)
+    assert "A value marked raw is judged with its noise" not in presented.render_page(usual)
 
 
 def test_a_limit_that_cannot_be_judged_is_not_passed(servo):

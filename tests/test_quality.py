@@ -11,6 +11,7 @@ from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import STATE_STAND
 from mwdcal.errors import InputError
+from mwdcal.presentation.verification import after_failure, screen
 from mwdcal.use.verification import Bounds, Limits, verify
 from simulation import DEG, Tool, plan
 from test_calibrate import NOISE, PROFILE, make, msgspec_replace
@@ -587,6 +588,61 @@ def test_references_of_one_day_that_differ_are_named(record, name, off, shown):
             assert f"references: {shown.format(field=field, other=field + off)}. " in texts[0]
 
 
+@pytest.mark.parametrize(
+    ("name", "shift", "size", "hint"),
+    [
+        ("azimuth", 180, "180°", "the opposite direction"),
+        ("azimuth", 12, "-12°", "another zero, north or sense"),
+        ("toolface", -90, "+90°", "another zero, north or sense"),
+        ("inclination", 8, "-8°", "another zero, north or sense"),
+    ],
+)
+def test_a_reference_that_is_wrong_at_all_toolfaces_is_named_and_no_harmonic(
+    record, name, shift, size, hint
+):
+    """Noise of a sound tool lies on both sides of half a turn: no jump of 360° is an error."""
+    right = roll(45, toolface=plan((45,))[2])
+    limits = Limits(name="e", error=Bounds(**{f"{name}_deg": 2.0}))
+    assert verify(record, right, limits).passed
+    wrong = msgspec_replace(right, known={**right.known, name: right.known[name] + shift * DEG})
+    result = verify(record, wrong, limits)
+    [row] = result.rows
+    assert row.value == pytest.approx(abs(shift), abs=0.2)
+    assert row.uncertainty < 0.1
+    assert max(row.harmonics) < 0.2
+    assert ids(result) == ["constant-error"]
+    text = next(f.text for f in result.findings if f.id == "constant-error")
+    assert text.startswith(f"error of {name}: every station is off by {size[:-1]}")
+    assert f"wrong by as much: {hint}? Correct it" in text
+    again, command, _ = after_failure(result, "tool.json", "roll.csv")
+    assert again.startswith("nothing to measure again")
+    assert command == "mwdcal verify tool.json roll.csv"
+
+
+def test_few_degrees_of_freedom_are_explained_on_the_screen(record):
+    few = calibrate(msgspec_replace(make(3, (10, 60, 120), 4), sd={}), PROFILE)
+    for calibration, said in ((record, False), (few, True)):
+        shown = screen(verify(calibration, roll(45, sd={}), SPREADS), None)
+        assert ("DoF, degrees of freedom of the 1σ" in shown) == said
+
+
+def test_errors_that_are_far_apart_stay_within_half_a_turn(record):
+    """x and y of the magnetometer are exchanged: the error of azimuth goes to and fro with the toolface."""
+    right = roll(45)
+    exchanged = right.magnetometer[:, [1, 0, 2]]
+    known = {**right.known, "azimuth": right.known["azimuth"] + 135 * DEG}
+    result = verify(record, msgspec_replace(right, magnetometer=exchanged, known=known), BOTH)
+    assert rows_of(result)["error of azimuth"].raw <= 180
+    assert "constant-error" not in ids(result)
+
+
+def test_a_large_bias_is_no_wrong_reference(record):
+    """A hundred times the limit: its error changes sign over the turn."""
+    result = verify(record, roll(45, tool=knocked(nanotesla=12_000)), BOTH)
+    assert "constant-error" not in ids(result)
+    assert "roll-harmonics" in ids(result)
+
+
 def several(count, seed, size, record, toolfaces=12, sd=NOISE):
     """Roll sets of one direction at 45°, each a group, of a tool knocked across its axis: a run."""
     face = np.tile(np.arange(toolfaces) * 360 / toolfaces, count) * DEG
@@ -645,4 +701,4 @@ def test_readings_that_scatter_too_little_name_the_noise_they_are_compared_with(
     (text,) = (each.text for each in result.findings if each.id == "little-scatter")
     assert STATE_STAND in text
     assert f"less about the curves than the {word} noise explains" in text
-    assert text.endswith(f"The 1σ rests on the {word} noise.")
+    assert text.endswith(f"The 1σ comes from the {word} noise.")

@@ -10,13 +10,19 @@ from msgspec.structs import replace as with_changes
 from scipy import special
 
 from cli_support import calibrated, mwdcal, servo_run, write_csv
-from mwdcal.calibration.automatic.drift import by_drift, chances, with_drift
+from mwdcal.calibration.automatic.drift import (
+    by_drift,
+    chances,
+    chances_without_drift,
+    with_drift,
+)
 from mwdcal.calibration.calibrate import calibrate
 from mwdcal.calibration.diagnosis.structure import shown_effects
 from mwdcal.calibration.estimate import fit
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.readings import Readings
 from mwdcal.calibration.record import Drift, Finding
+from mwdcal.calibration.residuals import Residuals, error_rows
 from mwdcal.calibration.results import StatedCovariance, drifts
 from mwdcal.certificate.budget import budget
 from mwdcal.errors import FitError
@@ -27,6 +33,7 @@ from mwdcal.files.formats.table import Table
 from mwdcal.files.profiles import load_profile
 from mwdcal.geometry.vectors import earth_field, earth_gravity, tool_from_earth
 from mwdcal.planning.expected import expected
+from mwdcal.planning.planned import judged, with_tool
 from mwdcal.planning.plans import drifted, load_plan
 from mwdcal.presentation.calibration import remarks
 from mwdcal.sensor.profile import Profile, StandProfile, TriadProfile
@@ -148,6 +155,67 @@ def test_a_drift_that_no_finding_names_is_on_the_screen_too():
         assert [line.endswith("does not foresee: field 31 ± 11 nT") for line in said] == [
             True
         ] * shown
+
+
+def test_a_plan_by_a_calibration_whose_run_drifted_says_that_it_does_not_foresee_that():
+    plan, profile = load_plan("twelve-state"), load_profile("servo")[0]
+    steady, planned = expected(plan, profile), judged(plan, profile)
+    drift = Drift(name="field", change=31.0, standard_uncertainty=11.0, unit="nT")
+    for drifts_of_run, said in (
+        ([], []),
+        ([drift], ["field 31 nT (1σ 11 nT)"]),
+        ([with_changes(drift, declared=40.0)], []),
+    ):
+        result = with_tool(planned, with_changes(steady, drift=drifts_of_run))
+        texts = [each.text for each in result.findings if each.id == "drift-unforeseen"]
+        assert [f"seems to have drifted: {each}. A plan" in text
+                for each, text in zip(said, texts, strict=True)] == [True] * len(said)  # fmt: skip
+
+
+@pytest.mark.parametrize("practice", [None, "per-station"], ids=["exact", "per station"])
+def test_the_noise_beside_a_drift_leaves_s_at_one(practice):
+    """Three times the noise, at stations whose angles err by more than it: it is still near that of the simulation."""
+    readings, rng = runs(44, 30, field=45.0, offset=3e-4), np.random.default_rng(44)
+    if practice:
+        sd = {name: np.radians(0.02) for name in ("inclination", "azimuth", "toolface")}
+        known = {n: readings.known[n] + s * rng.normal(size=(30, COUNT)) for n, s in sd.items()}
+        readings = replace(readings, known=readings.known | known, sd=sd, settings=practice)
+    options, seen = Options(order=0), 0
+    for _, result in by_drift(fit(readings, options), options):
+        np.testing.assert_allclose(result.analysis.variance_factor, 1, atol=2e-3)
+        if all(name in drifts(result) for name in ("accelerometer-drift", "field-drift")):
+            np.testing.assert_allclose(np.median(result.noise, 0), [1e-4, 15.0], rtol=0.15)
+            seen += len(result.noise)
+    assert seen > 10
+
+
+def test_the_chance_of_a_drift_is_that_of_the_run_as_a_steady_one():
+    """As the decision had it, by noise that the fit without the drift has."""
+    readings, rng = runs(44, 30, offset=3e-4), np.random.default_rng(44)
+    sd = {name: np.radians(0.02) for name in ("inclination", "azimuth", "toolface")}
+    known = {n: readings.known[n] + s * rng.normal(size=(30, COUNT)) for n, s in sd.items()}
+    readings = replace(readings, known=readings.known | known, sd=sd, settings="per-station")
+    options = Options(order=0)
+    steady = fit(readings, options)
+    decided = chances(steady)[0]
+    for places, result in by_drift(steady, options):
+        if result.problem.walks:
+            later = chances_without_drift(result, options)
+            np.testing.assert_allclose(np.log(later), np.log(decided[places]), atol=0.01)
+
+
+def test_the_expected_errors_include_the_drift_that_corrected_readings_keep():
+    """Three times the noise: by noise and stand alone the ratios of most observables would be above 1.3."""
+    readings, options, rows = runs(45, 60, field=45.0, offset=3e-4), Options(order=0), []
+    for places, result in by_drift(fit(readings, options), options):
+        if all(name in drifts(result) for name in ("accelerometer-drift", "field-drift")):
+            raw = readings.accelerometer[places], readings.magnetometer[places]
+            rows += error_rows(Residuals(Readings(*raw, known=readings.known, sd={}), result))
+    assert len(rows) > 30
+    for each in zip(*rows, strict=True):
+        after, expected = np.transpose([(row.after, row.expected) for row in each])
+        ratio = np.sqrt(np.mean(after**2) / np.mean(expected**2))
+        assert ratio == pytest.approx(1.0, abs=0.1), each[0].observable
 
 
 def test_a_member_of_a_batch_drifts_as_it_does_alone():

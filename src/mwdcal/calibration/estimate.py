@@ -71,6 +71,8 @@ MOST_AHEAD = 3.0
 """Largest power of s² that an estimate of the noise takes at once."""
 NOISE_ROUNDS = 8
 """Most repetitions of fit and estimate of the noise."""
+ROUNDS_ANEW = 40
+"""Most repetitions of the same with more unknowns in the fit: in simulations all have settled by then."""
 SETTLED = 1e-3
 """Change of noise and station weights, as a share, at which weighing and fitting in turn ends."""
 FEWEST_CHECKS = 20
@@ -257,12 +259,31 @@ def _general(problem: Problem, options: Options, finite: Bools) -> Fit:
     return _finished(stage, options, finite, iterations)
 
 
-def refitted(result: Fit, problem: Problem, state: State, scale: Array, options: Options) -> Fit:
-    """A fit of a problem that has more unknowns than that of `result`, the noise times `scale` (B, triads)."""
+def with_noise_anew(result: Fit, options: Options) -> Fit:
+    """The fits, and the noise that they estimate, in turn until s² is one; a member that has settled stays."""
+    for _ in range(ROUNDS_ANEW):
+        scale = _noise_scale(result.analysis, ahead=False)
+        scale = np.where(np.isnan(result.noise), 1.0, np.nan_to_num(scale, nan=1.0))
+        rest = np.flatnonzero(np.any(np.abs(scale - 1) >= SETTLED, -1))
+        if not rest.size:
+            break
+        part = take(result, rest)
+        again = refitted(part, part.problem, part.state, scale[rest], options, anew=True)
+        result = put(result, rest, again)
+    return result
+
+
+def refitted(
+    result: Fit, problem: Problem, state: State, scale: Array, options: Options, anew: bool = False
+) -> Fit:
+    """A fit of a problem that has more unknowns than that of `result`, the noise times `scale` (B, triads).
+
+    `anew`: where the fit can estimate the noise on its way, that counts.
+    """
     problem = _rescaled(problem, scale)
     finite = result.status != int(Status.NOT_FINITE)
     if result.analysis.squares is not None and uncertain_stand.applies(problem):
-        return _refined(result, problem, state, options)
+        return _refined(result, problem, state, options, anew)
     if form := _form(problem):
         there, analysis, good = form.solution(problem, state)
         if (good & analysis.determined.keep.all(-1)).all():
@@ -281,9 +302,10 @@ def _refitted_anyhow(result: Fit, problem: Problem, state: State, options: Optio
     return _finished(stage, options, finite, result.iterations + solved.iterations)
 
 
-def _refined(result: Fit, problem: Problem, state: State, options: Options) -> Fit:
+def _refined(result: Fit, problem: Problem, state: State, options: Options, anew: bool) -> Fit:
     """The same on a stand of known angles; by the method's minimiser where not all directions are determined."""
-    there = uncertain_stand.refined(problem, state)
+    there = uncertain_stand.refined(problem, state, anew)
+    problem = _rescaled(problem, there.scale)
     analysis = uncertain_stand.analysis_of(problem, there)
     good = there.good & analysis.finite & (result.status != int(Status.NOT_FINITE))
     status, steps = (

@@ -373,9 +373,15 @@ def _named(names: list[str], errors: Array) -> list[dict[str, float]]:
 
 
 def error_rows(residuals: Residuals) -> list[list[ErrorRow]]:
-    """Root mean square errors of each run before and after, and what was to be expected after."""
+    """Root mean square errors of each run before and after, and what was to be expected after.
+
+    Corrected readings keep a drift within the run that is part of the fit: it is expected besides noise and stand.
+    """
     rows: list[list[ErrorRow]] = [[] for _ in residuals.fit.status]
     kinds = residuals.errors_before, residuals.errors_after, residuals.expected
+    if residuals.fit.problem.walks:
+        steady = residuals.errors(residuals.undrifted)
+        kinds = *kinds[:2], {n: np.hypot(e, kinds[1][n] - steady[n]) for n, e in kinds[2].items()}
     for name, judged in residuals.judged.items():
         factor, unit = shown_in(name, residuals.readings.relative)
         sizes = (rms(np.where(judged, each[name], np.nan)) * factor for each in kinds)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace as with_fields
 
@@ -69,6 +70,20 @@ def temperature_terms_lost(tool: Calibration, planned: Calibration) -> list[Find
         "(docs, 'Planning')."
     )
     return [Finding(id="temperature-terms-lost", text=text)]
+
+
+def drift_unforeseen(tool: Calibration) -> list[Finding]:
+    """That the run of a calibration drifted by more than it declares, which no plan from it includes."""
+    sizes = [
+        f"{each.name} {each.change:.2g} {each.unit} (1σ {each.standard_uncertainty:.2g} {each.unit})"
+        for each in tool.drift
+        if each.declared is msgspec.UNSET
+    ]
+    text = (
+        f"the run of the calibration as `tool` seems to have drifted: {', '.join(sizes)}. A plan does not foresee it: "
+        "a run that drifts as much will be less accurate than planned."
+    )
+    return [Finding(id="drift-unforeseen", text=text)] if sizes else []
 
 
 def _check_scale(profile: Profile, kind: str) -> None:

@@ -33,6 +33,7 @@ from mwdcal.geometry.vectors import Array, Bools, Ints
 from mwdcal.planning.expected import (
     assumed_noise,
     carried_out,
+    drift_unforeseen,
     expected,
     left_undetermined,
     planned_fit,
@@ -331,11 +332,12 @@ class Planned:
 
 
 def with_tool(planned: Planned, tool: object) -> Planned:
-    """A plan with its `tool`, a calibration, which says so if it will lack temperature terms that this has."""
+    """A plan with its `tool`, a calibration: it says if it lacks temperature terms that this has, or a drift."""
     if not isinstance(tool, Calibration):
         return planned
     lost = temperature_terms_lost(tool, planned.calibration)
-    return replace(planned, assumed=[*planned.assumed, *lost], tool=tool)
+    remarks = [*planned.assumed, *lost, *drift_unforeseen(tool)]
+    return replace(planned, assumed=remarks, tool=tool)
 
 
 def judged(

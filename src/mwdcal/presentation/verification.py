@@ -20,6 +20,10 @@ FREEDOM = "DoF"
 """Title of a column of degrees of freedom."""
 MANY = 10_000
 """As good as unlimited degrees of freedom."""
+FREEDOM_RULE = (
+    "DoF, degrees of freedom of the 1σ: with few it is uncertain itself, with ∞ it is known"
+)
+"""The line under the decision rule where a 1σ has few degrees of freedom."""
 REFERENCES_OF = {
     "rotation": "reference inclinations", "toolface zero": "reference toolfaces", "scale": "reference strengths",
 }  # fmt: skip
@@ -27,7 +31,7 @@ REFERENCES_OF = {
 BETWEEN_SETS = "stations outside of roll sets"
 VERDICT_RISK = "risk of a wrong verdict, all roll sets and limits together"
 
-RAW_RULE = "Marked raw: the raw figure counts, as readings are not smooth over toolface"
+RAW_RULE = "A value marked raw is judged with its noise, as the readings do not follow a smooth curve over toolface"
 """The line under the decision rule where a raw figure was judged."""
 FAR_BEYOND = 3.0
 """Values of more than this times their limit, in every roll set, point to the tool rather than to one station."""
@@ -62,6 +66,7 @@ def screen(
         f"rule: {result.rule}",
     ]
     lines += filter(None, [raw_rule(result)])
+    lines += [FREEDOM_RULE] * any(row[4][0].isdigit() for row in rows)
     lines += [SETTING_PRACTICES[result.settings]] if result.settings in SETTING_PRACTICES else []
     lines += [f"{VERDICT_RISK}: {risk}"] if (risk := verdict_risk(result)) else []
     header = ["", "raw", "noise-free", "1σ", FREEDOM, "limit", "", "where"]
@@ -123,7 +128,11 @@ def after_failure(
     failed = [row for row in result.rows if row.uncertainty is not None and not row.passed]
     places = dict.fromkeys(row.note.partition(";")[0] for row in failed)
     if places:
-        command = f"mwdcal diagnose {record} {one_line(shell_word(str(run)))}"
+        tested = one_line(shell_word(str(run)))
+        if sum(finding.id == "constant-error" for finding in result.findings) == len(failed):
+            again = "nothing to measure again: correct the reference in the table"
+            return again, f"mwdcal verify {record} {tested}", "with it"
+        command = f"mwdcal diagnose {record} {tested}"
         again = f"measure again: {'; '.join(places)}"
         if any(finding.id == "harmonic-unseen" for finding in result.findings):
             again += ", at six or more toolfaces, evenly spread"

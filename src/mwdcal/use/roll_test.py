@@ -23,7 +23,7 @@ from mwdcal.calibration.record import FREE_SHARE, MAGNETIC, Calibration
 from mwdcal.calibration.residuals import tail
 from mwdcal.errors import InputError
 from mwdcal.estimation.problem import ANGLES
-from mwdcal.geometry.circle import resultant
+from mwdcal.geometry.circle import resultant, unrolled
 from mwdcal.geometry.observables import OBSERVABLES, OUTPUTS
 from mwdcal.geometry.vectors import Array, Bools, Ints, centred, eigen, inverse
 
@@ -937,6 +937,9 @@ class RollTest:
         """The values of a rolled set, their curve, and what their errors would be in other tests."""
         index = roll_set.index
         part = self._error(name)[index] if error else self._centred(name, roll_set)
+        if turn := OBSERVABLES[name].period:  # errors on both sides of half a turn are alike
+            line = unrolled(part, turn)
+            part = line if np.ptp(line) < turn / 4 else part
         noise, reference = self._noise(name)[index], self.reference_errors(name, roll_set, error)
         individual, together = reference.individual, reference.together
         if doubted and not roll_set.declared:

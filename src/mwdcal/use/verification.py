@@ -25,6 +25,7 @@ from mwdcal.calibration.record import (
 )
 from mwdcal.calibration.results import unknown_gravity
 from mwdcal.errors import InputError
+from mwdcal.estimation.problem import ANGLES
 from mwdcal.geometry.observables import OBSERVABLES
 from mwdcal.geometry.vectors import AnyArray, Array, eigen
 from mwdcal.sensor.profile import PRACTICES
@@ -147,6 +148,10 @@ WEAK = 0.5
 """A test whose 1σ is a larger share of the limit hardly distinguishes a good tool from a bad one."""
 NAMED_HARMONIC = 3.0
 """Standard uncertainties above which a harmonic is named as a cause."""
+STRAIGHT_BACK = 180.0
+"""Error of an angle of the opposite direction, degrees."""
+STEADY_OVER_TURN = 2.0
+"""An error is the same over a turn where its mean is more than so many times its harmonics."""
 FIRST_HARMONIC = {
     "inclination": "a bias of the accelerometer across the tool axis, or it leans",
     "azimuth": "a bias across the tool axis of either triad, or it leans",
@@ -175,15 +180,17 @@ VERDICT_FINDINGS = {
     "too small by it: add toolfaces between them.",
     "little-scatter": "{title}: the readings scatter less about the curves than the {noise} noise explains (chance "
     "below {chance:g}). {stand}This noise is too large, readings are repeated, or stations apart in the table share "
-    "one setting of the stand (then give them one group: it is counted once). The 1σ rests on the {noise} noise.",
+    "one setting of the stand (then give them one group: it is counted once). The 1σ comes from the {noise} noise.",
     "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
     "error is counted both ways. State [stand] settings in the profile.",
     "settings-unshared": UNSHARED,
     "not-smooth": "{title}: the readings leave a smooth curve over toolface by far more than their noise. So the raw "
-    "figure is judged, nothing is taken off it, and its 1σ rests on that scatter. A station was misread or moved, or "
-    "the tool has an error that these toolfaces do not resolve.",
+    "figure is judged with all its noise, and its 1σ comes from their scatter about that curve. A station was "
+    "misread or moved, or the tool has an error that these toolfaces do not resolve.",
     "weak-test": "{row.name}: its 1σ of {size} is more than half of the limit: by this limit alone the "
     "test can hardly tell a good tool from a bad one. Average longer at each station, or take more toolfaces.",
+    "constant-error": "{row.name}: every station is off by {size}° alike, which no tool does. The reference {angle} is "
+    "most likely wrong by as much: {hint}? Correct it and verify again.",
     "roll-harmonics": "{row.name} over a turn of toolface: {causes}.",
 }
 
@@ -681,7 +688,9 @@ def _judged(title: str, name: str, limit: float, outcome: Departures, guarded: b
     if sd > WEAK * limit and not worst.rough:
         size = f"{sd:.2g}{'' if row.unit == '°' else ' '}{row.unit}"
         findings.append(_finding("weak-test", row=row, size=size))
-    if causes := _causes(row, name, worst):
+    if off := list(_constant_error(row, name, worst)):
+        findings += off
+    elif causes := _causes(row, name, worst):
         findings.append(_finding("roll-harmonics", row=row, causes="; ".join(causes)))
     return _Judged(row, findings, remarks, overall.errors)
 
@@ -758,6 +767,21 @@ def _harmonics(worst: Statistic, factor: float) -> tuple[float, float] | None:
         return None
     first, second = (worst.curve.amplitudes * factor).tolist()
     return first, second
+
+
+def _constant_error(row: VerdictRow, name: str, worst: Statistic) -> Iterator[Finding]:
+    """That the error of a failed angle is the same over a turn, and larger than any tool's."""
+    if row.passed or row.harmonics is None or worst.curve is None or name not in ANGLES:
+        return
+    mean, most = (
+        float(np.degrees(worst.curve.coefficients[0])),
+        np.degrees(NO_ERROR_OF_A_TOOL[name]),
+    )
+    if row.two_sided and abs(mean) > max(most, STEADY_OVER_TURN * sum(row.harmonics)):
+        back = abs(abs(mean) - STRAIGHT_BACK) < most
+        size = f"{abs(mean):.3g}" if back else f"{mean:+.3g}"
+        hint = "the opposite direction" if back else "another zero, north or sense"
+        yield _finding("constant-error", row=row, angle=name, size=size, hint=hint)
 
 
 def _causes(row: VerdictRow, name: str, worst: Statistic) -> list[str]:

@@ -17,7 +17,7 @@ import numpy as np
 from mwdcal.calibration.automatic.courses import f_test, members, terms_beyond
 from mwdcal.calibration.diagnosis.plausibility import departures
 from mwdcal.calibration.diagnosis.structure import CONSTANT_ERRORS, shown_effects
-from mwdcal.calibration.estimate import Fit, fit, refitted, with_all
+from mwdcal.calibration.estimate import Fit, fit, refitted, with_all, with_noise_anew
 from mwdcal.calibration.methods import declared_sizes, with_constant_errors
 from mwdcal.calibration.options import Options
 from mwdcal.calibration.prior import PriorInformation
@@ -53,8 +53,6 @@ DISPUTED_CHANCE = 0.01
 
 A drift there would take up what is a conflict, or that error.
 """
-ERROR_ROUNDS = 3
-"""Repetitions of fit and estimate of the noise that such an error leaves."""
 EVERY_PARAMETER = 12
 """Parameters of a triad that are all fitted."""
 TOGETHER = 320
@@ -177,12 +175,8 @@ def _by_constant_errors(result: Fit, some: Ints, options: Options) -> Iterator[t
 def _with_constant_errors(result: Fit, names: Sequence[str], options: Options) -> Fit:
     """The fits with constant errors of the references as unknowns, and noise estimated anew where it was."""
     problem, state = with_constant_errors(result.problem, result.state, names)
-    scale = np.ones(result.noise.shape)
-    for _ in range(1 + ERROR_ROUNDS):
-        result = refitted(result, problem, state, scale, options)
-        scale = np.where(np.isnan(result.noise), 1.0, np.sqrt(result.analysis.variance_factor))
-        problem, state = result.problem, result.state
-    return result
+    result = refitted(result, problem, state, np.ones(result.noise.shape), options)
+    return with_noise_anew(result, options)
 
 
 def _apart(result: Fit, options: Options) -> bool:
@@ -287,17 +281,18 @@ def _whole(result: Fit, options: Options) -> Fit:
 
 
 def _without_drift(result: Fit, options: Options) -> Fit:
-    """The fit as if the run were steady."""
+    """The fit as if the run were steady, with the noise that it then has."""
     problem, state = drift.without_walks(result.problem, result.state)
-    return refitted(result, problem, state, np.ones(result.analysis.freedom.shape), options)
+    same = np.ones(result.analysis.freedom.shape)
+    return with_noise_anew(refitted(result, problem, state, same, options, anew=True), options)
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def with_drift(result: Fit, options: Options, triads: Bools, wrong: bool = False) -> Fit:
     """A fit with walks of estimated size that act on some triads (t,), from one without.
 
-    Where the references are `wrong` by constant errors the noise stays as the fit without walks has it: they are part
-    of it.
+    The noise is estimated with the walks in the fit. Where the references are `wrong` by constant errors it stays as
+    the fit without walks has it: they are part of it.
     """
     alone, _ = _undisputed(result, options)
     sizes, left = _sized(alone, triads)
@@ -307,7 +302,8 @@ def with_drift(result: Fit, options: Options, triads: Bools, wrong: bool = False
         for name, size in _sized(free, triads)[0].items():
             sizes[name][places] = size
     walking, state = drift.with_walks(result.problem, result.state, sizes)
-    return refitted(result, walking, state, np.sqrt(left), options)
+    result = refitted(result, walking, state, np.sqrt(left), options, anew=not wrong)
+    return result if wrong else with_noise_anew(result, options)
 
 
 def _sized(result: Fit, triads: Bools) -> tuple[dict[str, Array], Array]:

@@ -654,19 +654,21 @@ def solution(problem: Problem) -> Solution:
     return Solution(state, here, there.scale, determined, steps, good)
 
 
-def refined(problem: Problem, state: State) -> Solution:
-    """The fits from a state nearby, the noise being what the problem has."""
+def refined(problem: Problem, state: State, anew: bool) -> Solution:
+    """The fits from a state nearby; noise that is not declared is that of the problem, or is estimated `anew`."""
     at = closed_form.start(problem)
     first = [m for m in closed_form.minima(problem, at) if isinstance(m, AffineMinimum)]
     stand, forward = StandRuns.of(problem), _forward(problem, state)
     one, zero = np.ones((len(forward), 2)), np.zeros((len(forward), 2))
     start = _Turn(stand, forward, state.errors.mT, state.constants, one, zero, zero)
     sound = np.asarray(np.isfinite(state.params).all(-1))
-    there, steps, good = _settled(start, np.zeros(2, bool), sound)
+    estimated = np.array([anew and not triad.declared for triad in problem.triads])
+    there, steps, good = _settled(start, estimated, sound)
     there, here = there.last()
     state, determined = _ended(problem, there, first, at)
     good &= determined.clear & np.isfinite(state.params).all(-1)
-    return Solution(state, here, one, determined, steps, good)
+    good &= np.all((there.scale * stand.noise_share > LEAST_OF_SIGNAL) | ~estimated, -1)
+    return Solution(state, here, there.scale, determined, steps, good)
 
 
 @dataclass(frozen=True)
