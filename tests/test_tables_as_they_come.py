@@ -1197,7 +1197,7 @@ def test_a_cell_without_a_reading_is_named_with_the_option_that_leaves_its_row_o
     path = written(tmp_path / "a.csv", table(**{column: [*cells[:9], text, *cells[10:]]}))
     message = refused(mwdcal("profile", path, "-o", tmp_path / "t.toml"), 3)
     assert f"line 11, column '{NAMES[column]}'" in message
-    assert f"'{NAMES[column]}={text}'" in message
+    assert f'--leave-out "{NAMES[column]}={text}"' in message
     assert read(path, leave_out={NAMES[column]: [text]}).count == 47
 
 
