@@ -182,6 +182,21 @@ def test_a_nominal_reference_is_named_where_the_run_has_no_other(tmp_path, line)
     assert "reference-not-taken" not in {f.id for f in library.propose_profile(whole).findings}
 
 
+@pytest.mark.parametrize(
+    ("line", "listed"),
+    [
+        ("Feldstärke;48.0 µT", False), ("B total (uT);48.0", False), ("Totalfelt [nT];48000", False),
+        ("地磁场强度(nT);48000", False), ("Reference dip;63 deg", False), ("Gravty;9.80665", True),
+    ],
+)  # fmt: skip
+def test_a_line_that_is_read_is_no_misspelling_of_another_reference(tmp_path, line, listed):
+    """The run states no gravity: a line is near it by a letter, and another reference by its words."""
+    references = ("ref_gravity_g", "ref_field_nt", "ref_dip_deg")
+    path = written(tmp_path / "a.csv", table(**dict.fromkeys(references)), line, "", delimiter=";")
+    ids = [finding.id for finding in library.propose_profile(path).findings]
+    assert ("reference-not-taken" in ids) == listed
+
+
 TWO_PLACES = {
     "Dip 65.0 Aberdeen, 58.1 Houston": ("ref_dip_deg", 65.0),
     "Field in hut A;50 000 nT;Field in hut B;49 100 nT": ("ref_field_nt", 50_000.0),

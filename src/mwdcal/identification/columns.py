@@ -352,8 +352,8 @@ def _words_of(column: str) -> frozenset[str]:
 
 
 def _is_mistyped(word: str, meant: str) -> bool:
-    """Whether a word is another one with one letter too many, too few or wrong, or two exchanged."""
-    if word == meant or abs(len(word) - len(meant)) > 1:
+    """Whether a word is another one with a later letter too many, missing or wrong, or two exchanged."""
+    if word == meant or word[0] != meant[0] or abs(len(word) - len(meant)) > 1:
         return False
     first = next(
         (k for k, (a, b) in enumerate(zip(word, meant, strict=False)) if a != b),

@@ -48,6 +48,7 @@ from mwdcal.files.formats.layout import NO_READING, WITHOUT_VALUE, Layout, warmt
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
+from mwdcal.files.formats.title_references import references_in
 from mwdcal.files.marks import (
     MARKS_NAMED,
     UNMARKED,
@@ -1671,7 +1672,7 @@ def lines_not_taken(proposal: Proposal) -> list[Finding]:
         for column, (line, other) in block.others.items()
         if column in stated and not (column in named and named[column].name in proposal.where.names)
     ]
-    facts = (text for text in proposal.where.above if _FACT.fullmatch(text))
+    facts = [t for t in proposal.where.above if _FACT.fullmatch(t) and not references_in([[t]])]
     near = {c: t for t in facts for c in _STATED_COLUMNS if is_near(c, t)}
     lines = {c: shown(t)[1:-1] for c, t in (near | {**block.not_taken}).items()}
     return others + references_not_taken(
