@@ -94,7 +94,7 @@ def refused(ran: Ran, *codes: int) -> str:
     assert ran.out == ""
     assert len(ran.messages) == 1, ran.err
     (message,) = ran.messages
-    told = ran.err.replace("got nan", "").replace("got 'nan'", "")
+    told = ran.err.replace("got nan", "").replace("got 'nan'", "").replace("= ['nan']", "")
     for word in ("Traceback", "Warning", "internal error", "nan", "array("):
         assert word not in told, ran.err
     assert 30 < len(message) < 1000

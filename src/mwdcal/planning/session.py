@@ -55,7 +55,7 @@ class Session:
             InputError: the plan does not state an attitude, or the profile neither scale nor noise of a triad.
         """
         readings, scaled = nominal_run(plan, profile)
-        readings = replace(readings, profile=scaled)
+        readings = replace(readings, profile=scaled, self_scaled={})  # no tool's yet
         return cls(plan, scaled, readings, station_minutes(plan), effects or Effects())
 
     @property
