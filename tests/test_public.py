@@ -371,7 +371,7 @@ def test_the_practice_of_the_stand_is_stated_where_the_readings_are_from(tmp_pat
     }
     for where, cal in made.items():
         text = next(finding.text for finding in cal.findings if finding.id == "settings-apart")
-        assert f'state settings = "per-station" in {where}.' in text
+        assert f'State settings = "per-station" or "per-direction" in {where}.' in text
     stated = mwdcal.readings(*vectors, sd=sd, settings="per-station", **run.known)
     assert "settings-apart" not in {finding.id for finding in mwdcal.calibrate(stated).findings}
 

@@ -71,6 +71,20 @@ def test_a_tool_that_comes_back_has_a_table_of_its_own(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(("start", "count"), [(10, 1), (1, 2)])
+def test_a_run_of_two_days_whose_numbers_go_on_is_one(
+    tmp_path: Path, start: int, count: int
+) -> None:
+    """The same block is written again for the second day; numbers that begin anew are of another run."""
+    path = tmp_path / "days.csv"
+    first = [f"{k},{row}" for k, row in enumerate(FIRST, 1)]
+    second = [f"{k},{row}" for k, row in enumerate(SECOND, start)]
+    block = [A[0], "Date,2026-11-25"]
+    names = f"No.,{NAMES}"
+    path.write_text("\n".join([*A, names, *first, "", *block, names, *second]) + "\n")
+    assert len(tables.every_table(path)) == count
+
+
 def test_readings_of_another_table_state_no_reference(tmp_path: Path) -> None:
     """A strength of the channel Mz, with its unit in the name, is a reading."""
     path, names = tmp_path / "two.csv", NAMES.replace("Bz", "Mz raw (nT)")

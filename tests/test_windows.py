@@ -10,6 +10,7 @@ import io
 import json
 import multiprocessing
 import os
+import shlex
 import shutil
 import sys
 from concurrent.futures import Future
@@ -24,7 +25,7 @@ from mwdcal import pool
 from mwdcal import signals as signals_to_end
 from mwdcal.app import cli, interruption, messages
 from mwdcal.certificate import signature as key_files
-from mwdcal.errors import InputError
+from mwdcal.errors import InputError, shell_word
 from mwdcal.files.formats import atomic, sinks
 from test_fleet import pa, pq
 from test_fleet_kept import fleet, parts_of, small_fleet, small_parts  # noqa: F401
@@ -365,3 +366,13 @@ def test_a_reader_that_has_left_is_no_error(monkeypatch, number):
     monkeypatch.setattr(messages, "READER_HAS_LEFT", set())
     with pytest.raises(InputError, match="cannot write the result"):
         messages.Screen(Pipe()).write("text")
+
+
+@pytest.mark.parametrize(
+    "name", ["run.csv", "my run.csv", "a$HOME b.csv", "tool `x`.json", "it's.csv", 'a"b.csv']
+)
+def test_a_suggested_command_names_the_file_and_nothing_else(name):
+    """The reading of a POSIX shell by the standard library; no sign of it stays alive in double quotes."""
+    word = shell_word(name)
+    assert shlex.split(word) == [name]
+    assert word.startswith("'") or not {*word} & {*"$`!"}

@@ -10,7 +10,16 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
-shell_word = partial(re.compile(r"(?=.*[^\w./\\:+@=#~…-]).+", re.DOTALL).sub, r'"\g<0>"')
+
+def _in_quotes(match: re.Match[str]) -> str:
+    """A text in double quotes, which all shells take; in single ones as bash does where these leave signs alive."""
+    text = match[0]
+    if {*text} & {*'"$`!'}:
+        return "'" + text.replace("'", "'\\''") + "'"
+    return f'"{text}"'
+
+
+shell_word = partial(re.compile(r"(?=.*[^\w./\\:+@=#~…-]).+", re.DOTALL).sub, _in_quotes)
 """Quotes the name of a file as a command line needs it, where bash, cmd or PowerShell would take it apart."""
 _MOST_NAMED = 4
 """Answers that a message names."""
@@ -55,7 +64,7 @@ class Answer(NamedTuple):
     def options(self) -> str:
         """The arguments as options of a command, as a shell takes them; NUMBER for a number that has to be added."""
         said = [
-            *((n, _quoted(v)) for n, v in self.arguments),
+            *((n, shell_word(v)) for n, v in self.arguments),
             *((n, "NUMBER") for n in self.numbers),
         ]
         return " ".join(f"--{name.replace('_', '-')} {value}" for name, value in said)
@@ -90,13 +99,6 @@ def _said_by(answers: Sequence[str]) -> str:
     each = answers[:_MOST_NAMED]
     more = f" or {len(answers) - len(each)} others" if len(answers) > len(each) else ""
     return f" Answer by {' or '.join(each)}{more}." if each else ""
-
-
-def _quoted(value: str) -> str:
-    """A value as a shell takes it; as bash does where no quotes serve all shells."""
-    if {*value} & {*'"$`'}:
-        return "'" + value.replace("'", "'\\''") + "'"
-    return shell_word(value)
 
 
 class QuestionsError(FitError):

@@ -158,7 +158,7 @@ REMARKS = {
     "settings": "readings put the {angle} of {where} {value:+.3g}° from its reference: {size:.1f} σ of a setting of "
     "the stand. Check this reference, or declare a larger σ.",
     "settings-apart": "stations of one direction scatter by {share:.0%} of the stand's σ, as if the stand had been set "
-    'anew at each. If so, state settings = "per-station" in {where}.',
+    'anew at each, or as readbacks flicker. State settings = "per-station" or "per-direction" in {where}.',
     "settings-unshared": UNSHARED,
     "stand-too-large": "the stated σ of the stand is far larger than its errors in this run: {angles}. Uncertainties "
     "are too large: check it against the certificate.{radians}",

@@ -1041,11 +1041,19 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     block = [row for row in rows[heads[-1] : place] if not _is_reading(row[1])]
     facts = _facts(block)
     day = _facts([row for row in rows[: heads[-1]] if not _is_reading(row[1])]).get("date")
-    if "serial" in facts and facts.get("date", day) != day:
+    if "serial" in facts and facts.get("date", day) != day and not _go_on(rows, place):
         return True
     stated = [_tools_in(rows[start:end]) for start, end in pairwise([0, *heads])]
     ours = next(filter(None, stated[::-1]), set())
     return bool(_tools_in(block) - ours)
+
+
+def _go_on(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
+    """Whether the readings on both sides of a place are numbered on in their first cells."""
+    last = next((row for _, row in reversed(rows[:place]) if _is_reading(row)), [""])
+    first = next((row for _, row in rows[place:] if _is_reading(row)), [""])
+    ours, theirs = (as_text(row[0]).strip() for row in (last, first))
+    return ours.isdecimal() and theirs.isdecimal() and int(theirs) == int(ours) + 1
 
 
 def _tools_in(rows: Sequence[tuple[int, Cells]]) -> set[str]:
