@@ -775,7 +775,7 @@ FAR = "Inclinations up to {}°. If your stand reaches less, add --reach inclinat
     ],
 )
 def test_a_plan_beyond_many_stands_names_the_option_for_them(line, most):
-    """What it names does keep to 120°."""
+    """The suggested option keeps the plan within 120°."""
     shown = mwdcal("plan", *line, "--tool", "servo").out
     assert shown.count("If your stand reaches less") == (most is not None)
     assert most is None or FAR.format(most) in shown

@@ -552,7 +552,7 @@ def in_minutes(angles):
      ("Ι", "α", "β"), ("Inc", "φ", "ψ"), ("Inc", "Azi", "φ")],
 )  # fmt: skip
 def test_greek_letters_of_angles_in_minutes_are_told_by_the_readings(tmp_path, names):
-    """Whichever letter is which; codes of the same form beside the three are none of them."""
+    """Any letter may stand for any angle; other columns of such codes are not angles."""
     columns, exact = table(), {}
     for name, angle in zip(names, ("Inc (deg)", "Azi (deg)", "TF (deg)"), strict=True):
         columns[name], exact[angle] = in_minutes(columns.pop(angle))

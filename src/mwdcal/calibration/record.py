@@ -564,7 +564,7 @@ class Slopes(NamedTuple):
 
 READ_AGAIN = "Read them by the calibration's: mwdcal.read_run(…, cal.profile)."
 CALIBRATE_AGAIN = "Calibrate that run again."
-"""What to do about readings in a scale of their own; where the calibration has none."""
+"""Remedies where readings set their own scale, and where the calibration has kept none."""
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True):

@@ -325,7 +325,7 @@ TWO_PARTS = (
     "The depths start over there: is the table in it twice? Delete the copy. If it is the next run of the well, put "
     "its rows into another table, and name that by `run`."
 )
-"""What to do about depths that decrease: at any row, or once, where a second table seems to begin."""
+"""Remedies for decreasing depths: in general, and where a second table seems to begin."""
 
 
 def not_deeper(
@@ -368,10 +368,10 @@ def depth_column(table: Table, length_unit: str = "") -> tuple[str, float]:
 
 
 def check_path(lacking: str, **options: object) -> None:
-    """Refuse an option on positions where there are none; `lacking`: what a path lacks, blank where there is one.
+    """Refuse options that need a well path, if there is none; `lacking` says why, and is blank if there is one.
 
     Raises:
-        InputError: positions are asked for, and there are none.
+        InputError: an option needs a well path, and there is none.
     """
     names = [name for name, value in options.items() if value]
     if lacking and names:

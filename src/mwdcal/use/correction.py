@@ -222,14 +222,12 @@ RESULTS_BEYOND = (
     f"extrapolated, with no statement of accuracy, and marked in the column '{EXTRAPOLATED}'.",
 )
 """The treatment of results outside the calibrated temperatures."""
-ROWS_BEYOND = (
-    "{tally.beyond} of {tally.rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
-)
-"""Rows outside the calibrated temperatures and their margin."""
+ROWS_OUTSIDE = "{some} of {rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C"
+"""Rows outside the calibrated temperatures."""
 ROWS_DRIFTING = (
-    "{some} of {rows} rows lie outside the calibrated range {low:.1f}…{high:.1f} °C by up to {most:.1f} °C. The "
-    "calibration has no temperature terms, and 1σ contains no drift over the difference: about {turn:.4f}° of "
-    "inclination, if a bias drifts by {drift:.1f} µg/°C. Calibrate at several temperatures."
+    f"{ROWS_OUTSIDE} by up to {{most:.1f}} °C. The calibration has no temperature terms, and 1σ contains no drift over "
+    "the difference: about {turn:.4f}° of inclination, if a bias drifts by {drift:.1f} µg/°C. Calibrate at several "
+    "temperatures."
 )
 """Rows whose 1σ lacks the drift of the sensors from the calibrated temperatures."""
 COMPILED_ROWS = 300_000
@@ -453,9 +451,9 @@ def findings(
     """
     low, high = calibration.temperature_c or (np.nan, np.nan)
     if tally.beyond and outside == "refuse":
-        beyond = f"{readings.source}: {ROWS_BEYOND.format(tally=tally, low=low, high=high)}"
+        beyond = ROWS_OUTSIDE.format(some=tally.beyond, rows=tally.rows, low=low, high=high)
         advice = "Use `outside` blank or extrapolate, or calibrate over a wider range."
-        raise InputError(f"{beyond}. {advice}")
+        raise InputError(f"{readings.source}: {beyond}. {advice}")
     off, tools = strengths.departures(tally.strengths), other_tool(calibration, readings)
     changing = unsteady(tally.scatter)
     applies = {
@@ -499,30 +497,21 @@ def findings(
 def _away(calibration: Calibration, tally: RowCounts, outside: str) -> str:
     """The rows outside the calibrated temperatures: those without accuracy, and those whose 1σ lacks a drift."""
     (low, high), margin = calibration.temperature_c or (np.nan, np.nan), calibration.margin
+    there = {"rows": tally.rows, "low": low, "high": high}
     texts = []
     if tally.beyond:
         advice = "over a wider range" if calibration.thermal else "at several temperatures"
         results = RESULTS_BEYOND[outside == "extrapolate"].format(
             margin=margin, low=low - margin, high=high + margin, advice=f"Calibrate {advice}"
         )
-        beyond = ROWS_BEYOND.format(tally=tally, low=low, high=high)
+        beyond = ROWS_OUTSIDE.format(some=tally.beyond, **there)
         texts.append(f"{beyond}: their results are {results}")
     if some := tally.away - tally.beyond:
         coldest, hottest = tally.warmth
         most = min(max(low - coldest, hottest - high), margin)
         drift = tolerance(calibration.profile, TRIADS[0], "bias_per_c")
-        turn = np.degrees(drift * most)
-        texts.append(
-            ROWS_DRIFTING.format(
-                some=some,
-                rows=tally.rows,
-                low=low,
-                high=high,
-                most=most,
-                turn=turn,
-                drift=drift * 1e6,
-            )
-        )
+        sizes = {"most": most, "turn": np.degrees(drift * most), "drift": drift * 1e6}
+        texts.append(ROWS_DRIFTING.format(some=some, **there, **sizes))
     return " ".join(texts)
 
 

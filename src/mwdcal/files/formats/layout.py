@@ -600,10 +600,12 @@ def _are_numbered_on(tables: Sequence[Layout]) -> bool:
         [cell for cells in each for cell in cells]
         for each in zip(*(t.texts for t in tables), strict=True)
     )
-    return any(
-        all(map(str.isdecimal, cells)) and all(int(b) == int(a) + 1 for a, b in pairwise(cells))
-        for cells in columns
-    )
+    return any(map(_number_on, columns))
+
+
+def _number_on(cells: Sequence[str]) -> bool:
+    """Whether cells are whole numbers that go on by one."""
+    return all(map(str.isdecimal, cells)) and all(int(b) == int(a) + 1 for a, b in pairwise(cells))
 
 
 def _joined_sheets(tables: Sequence[Layout]) -> Layout:
@@ -1052,8 +1054,7 @@ def _go_on(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
     """Whether the readings on both sides of a place are numbered on in their first cells."""
     last = next((row for _, row in reversed(rows[:place]) if _is_reading(row)), [""])
     first = next((row for _, row in rows[place:] if _is_reading(row)), [""])
-    ours, theirs = (as_text(row[0]).strip() for row in (last, first))
-    return ours.isdecimal() and theirs.isdecimal() and int(theirs) == int(ours) + 1
+    return _number_on([as_text(row[0]).strip() for row in (last, first)])
 
 
 def _tools_in(rows: Sequence[tuple[int, Cells]]) -> set[str]:
