@@ -403,7 +403,7 @@ class Proposal(NamedTuple):
 
 
 def propose(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Table,
     *,
     sheet: str = "",
     header_row: int = 0,
@@ -414,7 +414,7 @@ def propose(
     leave_out: Mapping[str, Sequence[str]] | None = None,
     keep: Mapping[str, Sequence[str]] | None = None,
 ) -> Proposal:
-    """The profile with which a table of stations at known attitudes is a calibration run.
+    """The profile with which a table of stations at known attitudes, a file or one in memory, is a calibration run.
 
     `sheet`, `header_row` and `decimal` say where the table is and how its numbers are written, `answers` which
     column holds what, or the number of a reference,
@@ -425,8 +425,11 @@ def propose(
         InputError: the file cannot be read, or is no table of stations.
         FitError: columns and units that names and readings leave open, or readings that no axes explain.
     """
-    where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
-    table, form = as_written(path, where, bool(sheet or header_row or decimal))
+    if isinstance(path, Table):
+        where, table, form = None, path, TableFormat(find=True)
+    else:
+        where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
+        table, form = as_written(path, where, bool(sheet or header_row or decimal))
     given = stated_numbers(answers or {}, table.columns)
     names = {column: name for column, name in (answers or {}).items() if column not in given}
     stated = {**(stated or {}), **given}
@@ -435,7 +438,8 @@ def propose(
     place = {"header_line": header_row} if header_row else {}
     said = {**place, **(north or {}), "leave_out": leave_out or {}, "keep": keep or {}}
     form = _with(form, {key: value for key, value in said.items() if value not in ({}, None)})
-    with_answers = partial(_proposal, path, where, table, form, stated)
+    name = table.source if isinstance(path, Table) else Path(path).stem
+    with_answers = partial(_proposal, name, where, table, form, stated)
     again = partial(
         propose, path, sheet=sheet, header_row=header_row, decimal=decimal, answers=answers, stated=stated, north=north
     )  # fmt: skip
@@ -527,7 +531,7 @@ _WITHOUT_RESULT = "its formulas have no value, as no spreadsheet program has sav
 
 
 def _proposal(
-    path: str | os.PathLike[str],
+    name: str,
     where: Layout | None,
     table: Table,
     form: TableFormat | None,
@@ -537,7 +541,7 @@ def _proposal(
     """The proposal for a table that was read, with what the user says of its columns."""
     whole = table
     table, form, columns, by_value, ignored = named_columns(table, form, where, answers)
-    if filled := _with_angles_filled(path, where, (table, whole), columns, form, stated, answers):
+    if filled := _with_angles_filled(name, where, (table, whole), columns, form, stated, answers):
         return filled
     _check_choices(where, {*columns, *table.metadata, *answers}, table.source)
     check_cells(table, columns)
@@ -555,10 +559,10 @@ def _proposal(
         table = means(table, columns, sets)
         if "group" in columns and len({*labels_of(table, columns["group"].name)}) < 2:
             del columns["group"]  # it tells the readings of a station apart
-    profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
+    profile = Profile(name=name, table=form or msgspec.UNSET, columns=columns)
     said = {*answers, *stated}
     profile, readings, wirings, open_axes = _wired_and_checked(table, profile, by_value, said)
-    name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
+    name, triads = str(readings.metadata.get("serial", name)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
     remarks = [*readings.remarks, *blank]
     if sets:
@@ -626,7 +630,7 @@ def named_columns(
     """
     formulas = [name for name in table.columns if _is_formulas(labels_of(table, name))]
     table = replace(table, columns={n: c for n, c in table.columns.items() if n not in formulas})
-    units_by_name = dict(zip(where.names, where.units, strict=True)) if where else {}
+    units_by_name = dict(zip(where.names, where.units, strict=True)) if where else table.units
     names = [*table.columns]
     units = [units_by_name.get(name, "") for name in names]
     above = where.above if where else ()
@@ -642,7 +646,7 @@ def named_columns(
 
 
 def _with_angles_filled(
-    path: str | os.PathLike[str],
+    name: str,
     where: Layout | None,
     pair: tuple[Table, Table],
     columns: Mapping[str, ColumnSource],
@@ -658,7 +662,7 @@ def _with_angles_filled(
     if once := once_for_setting(table, columns) or written_once(table, columns):
         form = _with(form, {"fill_down": once})
         with suppress(InputError, FitError):
-            proposal = _proposal(path, where, filled_down(whole, once), form, stated, answers)
+            proposal = _proposal(name, where, filled_down(whole, once), form, stated, answers)
             if _is_confirmed(proposal):
                 return proposal
     return None
