@@ -676,6 +676,9 @@ def _wired_and_checked(
     columns = profile.columns
     try:
         profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
+    except InputError as error:
+        _check_exchanged(table, profile, answers, error)
+        raise
     except FitError:
         _ask_gons(table, {c: columns[c] for c in ANGLES_OF_STAND if c in by_value})
         _check_dip(table, profile, answers)
@@ -687,6 +690,31 @@ def _wired_and_checked(
     _check_magnetic(table, readings, wirings, columns)
     _check_repeats(table, columns, profile.form)
     return profile, readings, wirings, open_axes
+
+
+_FIT_EXCHANGED = "The readings fit with"
+"""The first words of the question on two angles that are exchanged."""
+
+
+def _check_exchanged(
+    table: Table, profile: Profile, answers: Collection[str], error: InputError
+) -> None:
+    """Ask whether the inclination is exchanged with another angle, where an error is gone and gravity fits then."""
+    columns = profile.columns or {}
+    inclination, *others = ANGLES_OF_STAND
+    for other in others:
+        if not {inclination, other} <= {*columns} - {*answers}:
+            continue
+        pair = {inclination: columns[other], other: columns[inclination]}
+        exchanged = msgspec.structs.replace(profile, columns={**columns, **pair})
+        result = None
+        with suppress(FitError, InputError):
+            result = _wired(table, exchanged)[2].get("accelerometer")
+        if result and result.unexplained < _CONFIRMED:
+            names = " and ".join(shown(columns[column].name) for column in pair)
+            said = tuple(("column", f"{column}={each.name}") for column, each in pair.items())
+            answer = Answer("they are exchanged", said)
+            raise QuestionError(f"{error} {_FIT_EXCHANGED} {names} exchanged.", [answer])
 
 
 def _is_formulas(cells: Sequence[str]) -> bool:
@@ -843,7 +871,7 @@ def _is_of_readings(answer: Answer, question: QuestionError) -> bool:
     Angles that the tool itself may have measured fit its readings whatever the stand shows, and the channels of each
     of several tools fit.
     """
-    if any(words in question.text for words in (MEASURED_BY_TOOL, OF_SEVERAL_TOOLS)):
+    if any(words in question.text for words in (MEASURED_BY_TOOL, OF_SEVERAL_TOOLS, _FIT_EXCHANGED)):
         return False
     pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
     return len(pairs) == len(answer.arguments) and all(
@@ -894,7 +922,7 @@ def with_north(
 
 _WORDS_OF_TOOLS = re.compile(
     r"s[eé]rie|serial|s/?n\b|tool|probe|sond[ea]|ger[äa]t|instrument|equip|ferram|herram|verkt(ø|oe?)y|matr[ií]c|"
-    r"прибор|зонд|зав|仪器|探管|编号",
+    r"\balat\b|\balet\b|\bcihaz|прибор|зонд|зав|仪器|探管|编号",
     re.IGNORECASE,
 )
 """Words of a column that may tell several tools apart."""
