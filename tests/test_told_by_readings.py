@@ -1091,7 +1091,9 @@ def test_an_inclination_that_is_exchanged_with_the_toolface_is_named(tmp_path, a
 def test_an_angle_out_of_range_is_not_called_exchanged_where_the_readings_deny_it(tmp_path):
     run = table()
     run["Inc (deg)"] = 2.5 * run["Inc (deg)"]
-    message = refused(mwdcal("profile", write_csv(tmp_path / "a.csv", run), "-o", tmp_path / "t"), 2)
+    message = refused(
+        mwdcal("profile", write_csv(tmp_path / "a.csv", run), "-o", tmp_path / "t"), 2
+    )
     assert "exchanged" not in message
 
 

@@ -57,6 +57,7 @@ from mwdcal.files.marks import (
     is_the_repeat,
     marks_in,
     place,
+    second_run,
     without_rejected,
 )
 from mwdcal.files.metadata import toml
@@ -425,11 +426,7 @@ def propose(
         InputError: the file cannot be read, or is no table of stations.
         FitError: columns and units that names and readings leave open, or readings that no axes explain.
     """
-    if isinstance(path, Table):
-        where, table, form = None, path, TableFormat(find=True)
-    else:
-        where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
-        table, form = as_written(path, where, bool(sheet or header_row or decimal))
+    where, table, form = _table_of(path, sheet, header_row, decimal)
     given = stated_numbers(answers or {}, table.columns)
     names = {column: name for column, name in (answers or {}).items() if column not in given}
     stated = {**(stated or {}), **given}
@@ -460,6 +457,16 @@ def propose(
         if by_readings := _answer_by_readings(error, with_answers, names, table):
             return by_readings
         raise
+
+
+def _table_of(
+    source: str | os.PathLike[str] | Table, sheet: str, header_row: int, decimal: str
+) -> tuple[Layout | None, Table, TableFormat | None]:
+    """Where the table of a file is, the table, and how it is written; the profile of one in memory looks for it."""
+    if isinstance(source, Table):
+        return None, source, TableFormat(find=True)
+    where = tables.laid_out(source, sheet=sheet, header_row=header_row, decimal=decimal)
+    return where, *as_written(source, where, bool(sheet or header_row or decimal))
 
 
 def _questions_of(error: QuestionError | QuestionsError) -> Sequence[QuestionError]:
@@ -551,6 +558,7 @@ def _proposal(
     form = _with(form, {"ignore": (*ignored, *denied)} if ignored or denied else {})
     columns |= _stacked_tools(table, columns, stated, answers)
     table = _of_one_tool(table, columns, stated)
+    table = replace(table, remarks=(*table.remarks, *second_run(table)))
     columns |= station_column(table, columns, answers)
     columns |= {c: ColumnSource(name=f"{stated[c]}") for c in _OF_THE_PLACE if c in stated}
     sets = repeats(table, columns)
@@ -871,7 +879,9 @@ def _is_of_readings(answer: Answer, question: QuestionError) -> bool:
     Angles that the tool itself may have measured fit its readings whatever the stand shows, and the channels of each
     of several tools fit.
     """
-    if any(words in question.text for words in (MEASURED_BY_TOOL, OF_SEVERAL_TOOLS, _FIT_EXCHANGED)):
+    if any(
+        words in question.text for words in (MEASURED_BY_TOOL, OF_SEVERAL_TOOLS, _FIT_EXCHANGED)
+    ):
         return False
     pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
     return len(pairs) == len(answer.arguments) and all(

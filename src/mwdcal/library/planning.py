@@ -20,7 +20,14 @@ from mwdcal.geometry.vectors import AnyArray
 from mwdcal.library.answers import Said, by_column
 from mwdcal.library.results import Result, arrays_of
 from mwdcal.library.shown import digest_of
-from mwdcal.library.tasks import NOMINAL, Tabular, loaded_profile, table_in_memory, table_of, with_choices
+from mwdcal.library.tasks import (
+    NOMINAL,
+    Tabular,
+    loaded_profile,
+    table_in_memory,
+    table_of,
+    with_choices,
+)
 from mwdcal.sensor.profile import Profile
 
 if TYPE_CHECKING:

@@ -454,7 +454,7 @@ _NOT_READ = (
 
 
 def _side_by_side(one: Layout, other: Layout, wanted: Collection[str]) -> Layout:
-    """A table with the columns of another sheet that it does not have; the one with all that is `wanted` comes first."""
+    """A table with the columns of another sheet that it does not have; the one with all `wanted` comes first."""
     if wanted and {*wanted} <= {*other.names}:
         one, other = other, one
     _, equal = _shared(one, other)
