@@ -161,7 +161,10 @@ def test_a_new_sheet_whose_channels_have_other_names_is_not_passed_over(order: i
     ):
         layout.laid_out([old, new][::order], "w.xlsx", wanted=WANTED)
     for new, said in (
-        (with_names("Run 2026", OTHERS), r"those of 'Run 2026' at the same stations are not read"),
+        (
+            with_names("Run 2026", OTHERS),
+            r"those of 'Run 2026' at the same stations are no part of",
+        ),
         (
             with_names("Run 2026", ALL_OTHERS),
             "the 9 readings under other names on sheet 'Run 2026'",

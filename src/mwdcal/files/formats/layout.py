@@ -448,9 +448,8 @@ def _are_of_one_triad_each(one: Layout, other: Layout) -> bool:
     return min(len(names[0] & names[1]), *triads) >= LEAST_COLUMNS - 1
 
 
-_NOT_READ = (
-    "are not read. If they are the run, propose a tool profile for its sheet: mwdcal profile."
-)
+_NO_PART = "are no part of this run. If they are the run, propose a tool profile for their sheet: mwdcal profile."
+"""The end of a remark on readings that are not taken as those of the profile."""
 
 
 def _side_by_side(one: Layout, other: Layout, wanted: Collection[str]) -> Layout:
@@ -466,7 +465,7 @@ def _side_by_side(one: Layout, other: Layout, wanted: Collection[str]) -> Layout
         f"the same {', '.join(n for n in one.names if n in equal)}."
     )
     if wanted and {*wanted} <= {*one.names}:
-        said = f"the channels are those of {places[0]}; those of {places[1]} at the same stations {_NOT_READ}"
+        said = f"the channels are those of {places[0]}; those of {places[1]} at the same stations {_NO_PART}"
     return replace(
         one,
         names=names,
@@ -736,7 +735,7 @@ def _check_renamed(
 def _under_other_names(tables: Sequence[Layout], wanted: Collection[str]) -> list[str]:
     """A remark on each of some tables that looks like a run, and has none of the channels that are `wanted`."""
     return [
-        f"the {len(t.lines)} readings under other names on sheet {shown(t.sheet)} {_NOT_READ}"
+        f"the {len(t.lines)} readings under other names on sheet {shown(t.sheet)} {_NO_PART}"
         for t in tables
         if t.sheet and not t.kind and len(t.lines) >= _BESIDES and {*wanted}.isdisjoint(t.names)
         if _has_axes(t.names) and angles_among(t.names)
