@@ -1,5 +1,6 @@
 """What `import mwdcal` offers for each command, and that its results say what the commands print."""
 
+import datetime
 import json
 import re
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 import mwdcal
-from cli_support import EXAMPLE
+from cli_support import EXAMPLE, RAW, servo_run, write_csv
 from cli_support import mwdcal as command
 from mwdcal.app.cli import SECTIONS, cli
 from mwdcal.calibration.methods import EVIDENCE
@@ -284,6 +285,55 @@ def test_a_column_that_is_no_number_is_text_and_refused_only_where_it_is_needed(
         assert np.isfinite(task(made, {**table, **beside}).columns["inclination_deg"]).all()
     with pytest.raises(mwdcal.InputError, match=r"row 1, column 'ax': expected a number; .*Write"):
         mwdcal.read_run({**table, "ax": beside["Time"]}, PROFILE)
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_a_profile_of_a_table_in_memory_is_that_of_its_file(library, tmp_path):
+    """Names with blanks too many, and times as times: as the same table as CSV."""
+    tables = pytest.importorskip(library)
+    run = servo_run()
+    dates = [datetime.datetime(2026, 3, 5, 8, 0) + datetime.timedelta(minutes=k) for k in range(48)]
+    named = {
+        "Pos": run["station"], "Time": dates, "Inc  (deg)": run["ref_inclination_deg"],
+        "Azi ": run["ref_azimuth_deg"], "TF": run["ref_toolface_deg"], "Btotal (nT)": run["ref_field_nt"],
+        **{f"{'GH'[n > 2]}{'xyz'[n % 3]} (V)": run[name] for n, name in enumerate(RAW)},
+    }  # fmt: skip
+    cells = {name: [*map(str, column)] for name, column in named.items()}
+    path = write_csv(tmp_path / "a.csv", cells)
+    table = tables.DataFrame(named)
+    of_file, of_table = mwdcal.propose_profile(path), mwdcal.propose_profile(table)
+    for part in ("columns", "accelerometer", "magnetometer", "stand"):
+        assert getattr(of_file.profile, part) == getattr(of_table.profile, part)
+    assert of_file.findings == of_table.findings
+    assert "delimiter" not in of_table.summary()
+    one, two = mwdcal.calibrate(path, of_file.profile), mwdcal.calibrate(table, of_table.profile)
+    assert (one.accelerometer, one.magnetometer) == (two.accelerometer, two.magnetometer)
+    of_table.save(tmp_path / "tool.toml")
+    three = mwdcal.calibrate(path, tmp_path / "tool.toml")
+    assert (one.accelerometer, one.magnetometer) == (three.accelerometer, three.magnetometer)
+
+
+def test_units_below_the_names_of_a_table_in_memory_are_its_columns_units():
+    pandas = pytest.importorskip("pandas")
+    columns = {name.split(" (")[0]: cells for name, cells in own_names().items()}
+    units = {name: name.split("(")[1].strip(")") if "(" in name else "" for name in own_names()}
+    below = {name.split(" (")[0]: [unit] for name, unit in units.items()}
+    table = pandas.concat([pandas.DataFrame(below), pandas.DataFrame(columns)])
+    profile = mwdcal.propose_profile(table).profile
+    assert {each.name: each.unit for each in profile.columns.values()} == {
+        "Pos": "", "Gx": "V", "Gy": "V", "Gz": "V", "Inc": "°", "TF": "°",
+    }  # fmt: skip
+    named = mwdcal.calibrate(own_names(), mwdcal.propose_profile(own_names()).profile)
+    assert mwdcal.calibrate(table, profile).accelerometer == named.accelerometer
+
+
+def own_names():
+    """A run of accelerometers under the names of a laboratory, with units in them."""
+    run = servo_run()
+    return {
+        "Pos": run["station"], "Inc (deg)": run["ref_inclination_deg"], "TF (deg)": run["ref_toolface_deg"],
+        **{f"G{axis} (V)": run[f"a{axis}"] for axis in "xyz"},
+    }  # fmt: skip
 
 
 def test_a_row_of_units_below_the_names_in_pandas_is_no_station(tmp_path):

@@ -140,3 +140,58 @@ def test_tables_on_two_sheets_and_twice_on_one_are_told_apart() -> None:
         (("sheet", "A"), ("header_row", "1")),
         (("sheet", "A"), ("header_row", "12")),
     } <= answers
+
+
+def with_names(name: str, names: str, count: int = 9) -> layout.Sheet:
+    """A sheet of readings under names of its own."""
+    plain = sheet(name, count=count)
+    return plain._replace(rows=[(1, names.split(",")), *plain.rows[1:]])
+
+
+OTHERS = "Inc,Azi,TF,Accel X,Accel Y,Accel Z,Flux X,Flux Y,Flux Z"
+ALL_OTHERS = OTHERS.replace("Inc,Azi,TF", "Neigung,Richtung,Rollwinkel")
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_new_sheet_whose_channels_have_other_names_is_not_passed_over(order: int) -> None:
+    """Last year's sheet still has the names of the profile: it is asked about, or a finding names the new one."""
+    old, new = sheet("Run 2025"), with_names("Run 2026", OTHERS, 8)
+    with pytest.raises(
+        QuestionError, match=r"'Run 2026' has no columns 'Gx', .*; sheet 'Run 2025' has. If"
+    ):
+        layout.laid_out([old, new][::order], "w.xlsx", wanted=WANTED)
+    for new, said in (
+        (
+            with_names("Run 2026", OTHERS),
+            r"those of 'Run 2026' at the same stations are no part of",
+        ),
+        (
+            with_names("Run 2026", ALL_OTHERS),
+            "the 9 readings under other names on sheet 'Run 2026'",
+        ),
+    ):
+        read = layout.laid_out([old, new][::order], "w.xlsx", wanted=WANTED)
+        assert read.sheet == "Run 2025"
+        assert any(said in each for each in read.remarks)
+        assert not layout.laid_out([old], "w.xlsx", wanted=WANTED).remarks
+
+
+def test_the_angles_of_a_run_are_those_of_the_sheet_with_its_channels() -> None:
+    """Another year's sheet of the same stations, in front, has read other inclinations."""
+    new = with_names("Run 2026", "No,Rolls,Inc,Azi,TF,Accel X,Accel Y,Accel Z")
+    old = with_names("Run 2025", "No,Rolls,Inc,Azi,TF,Gx,Gy,Gz")
+    for number, each in enumerate((new, old)):
+        each.rows[1:] = [
+            (k, [k, 7 * k % 5, 15 + k + 0.01 * number, 10 * k, 40 * k, *row[3:6]])
+            for k, row in each.rows[1:]
+        ]
+    read = layout.laid_out([new, old], "w.xlsx", wanted=("Gx", "Gy", "Gz"))
+    assert read.cells[read.names.index("Inc")][0] == "17.01"
+
+
+def test_channels_of_two_sheets_are_joined_without_a_word_on_another_run() -> None:
+    """A profile of both triads: each on a sheet of its own."""
+    one = with_names("Acc", "Inc,Azi,TF,Gx,Gy,Gz")
+    two = with_names("Mag", "Inc,Azi,TF,Bx,By,Bz")
+    (said,) = layout.laid_out([one, two], "w.xlsx", wanted=WANTED).remarks
+    assert "'Acc' and 'Mag' are one table" in said

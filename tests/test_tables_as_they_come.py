@@ -1034,6 +1034,65 @@ def test_remarks_that_are_not_understood_are_named_in_one_line(tmp_path):
     assert said not in " ".join(ran.err.split())
 
 
+def test_a_remark_is_named_once_where_its_rows_are_used_and_a_word_for_the_first_row_is_none(
+    tmp_path,
+):
+    """Profile and calibrate name it once each; a row that is left out and the words start and end are not named."""
+    remarks = {1: "Start", 8: "lihat buku", 9: "rejected", 48: "(end)"}
+    path = written(tmp_path / "a.csv", table(**marked("Note", remarks)))
+    tool, said = tmp_path / "tool.toml", "used: line 9 ('Note': lihat buku). To leave them out"
+    for command in (("profile", path, "-o", tool), ("calibrate", path, "--tool", tool)):
+        ran = mwdcal(
+            *command, *(("-o", tmp_path / "cal.json") if command[0] == "calibrate" else ())
+        )
+        assert " ".join(ran.err.split()).count("lihat buku") == 1, ran
+        assert said in " ".join(ran.err.split())
+
+
+def of_two_days(first, second, form="%Y-%m-%d", temperatures=(25.0, 25.0)):
+    """The runs of one tool on two days, one below the other, each with stations from 1."""
+    tool = Tool.random(1, noise=(1e-4, 15.0))
+    runs = [servo_run(k, temperatures=(t,), tool=tool) for k, t in enumerate(temperatures)]
+    days = [
+        f"{datetime.date.fromisoformat(day):{form}}" for day in (first, second) for _ in range(48)
+    ]
+    both = {name: np.concatenate([run[name] for run in runs]) for name in runs[0]}
+    return table(**both, Date=days)
+
+
+@pytest.mark.parametrize("form", ["%Y-%m-%d", "%d.%m.%Y 08:15"])
+def test_two_runs_of_different_years_below_one_heading_are_named(tmp_path, form):
+    """In the profile and in the calibration, with the row at which the second begins, and both days."""
+    columns = of_two_days("2025-03-14", "2026-03-25", form)
+    path, tool = written(tmp_path / "a.csv", columns), tmp_path / "tool.toml"
+    said = "'Pos' begins again at line 50, and the date goes from 2025-03-14 to 2026-03-25."
+    for command in (
+        ("profile", path, "-o", tool),
+        ("calibrate", path, "--tool", tool, "-o", tmp_path / "c"),
+    ):
+        assert said in " ".join(mwdcal(*command).err.split())
+    columns["Date"] = [day if k in (0, 48) else "" for k, day in enumerate(columns["Date"])]
+    assert said in " ".join(read(written(tmp_path / "once.csv", columns)).remarks)
+    del columns["Pos"]
+    (remark,) = read(written(tmp_path / "bare.csv", columns)).remarks
+    assert "'Inc (deg)' begins again at line 50" in remark
+
+
+@pytest.mark.parametrize("case", ["temperatures", "numbers go on", "a serial each"])
+def test_days_of_one_run_are_not_two_runs(tmp_path, case):
+    """Numbers that begin again at each temperature; numbers that go on after a summer; a table of two tools."""
+    columns = of_two_days("2026-03-14", "2026-03-25", temperatures=(25.0, 80.0))
+    if case != "temperatures":
+        columns = of_two_days("2026-03-14", "2026-08-25")
+    said = {}
+    if case == "numbers go on":
+        columns["Pos"] = np.arange(1, 97)
+    if case == "a serial each":
+        columns, said = {**columns, "Serial": ["A-1"] * 48 + ["A-2"] * 48}, {"serial": "A-2"}
+    proposed = library.propose_profile(written(tmp_path / "a.csv", columns), **said)
+    assert "begins again" not in " ".join(each.text for each in proposed.findings)
+
+
 @pytest.mark.parametrize(
     "cells",
     [

@@ -1071,3 +1071,40 @@ def test_a_declination_to_the_west_by_its_whole_word():
 def test_a_declination_at_a_place():
     rows = [["Pier azimuths from TRUE north. Mag declination at pier 8.62 deg E (May 2024)"]]
     assert titles(rows).metadata == {"declination_deg": 8.62, "azimuth_reference": "true"}
+
+
+@pytest.mark.parametrize("absent", [(), ("Azi (deg)",)])
+def test_an_inclination_that_is_exchanged_with_the_toolface_is_named(tmp_path, absent):
+    """Its range refuses it, and the readings fit with both exchanged."""
+    run = table(**dict.fromkeys(absent))
+    right = library.propose_profile(write_csv(tmp_path / "right.csv", run)).findings
+    run["Inc (deg)"], run["TF (deg)"] = run["TF (deg)"], run["Inc (deg)"]
+    path = write_csv(tmp_path / "a.csv", run)
+    message = refused(mwdcal("profile", path, "-o", tmp_path / "tool.toml"), 3)
+    assert "got 210 °" in message
+    assert "The readings fit with 'Inc (deg)' and 'TF (deg)' exchanged." in message
+    said = ["ref_inclination_deg=TF (deg)", "ref_toolface_deg=Inc (deg)"]
+    assert f'--column "{said[0]}" --column "{said[1]}"' in message
+    assert library.propose_profile(path, column=said).findings == right
+
+
+def test_an_angle_out_of_range_is_not_called_exchanged_where_the_readings_deny_it(tmp_path):
+    run = table()
+    run["Inc (deg)"] = 2.5 * run["Inc (deg)"]
+    message = refused(
+        mwdcal("profile", write_csv(tmp_path / "a.csv", run), "-o", tmp_path / "t"), 2
+    )
+    assert "exchanged" not in message
+
+
+@pytest.mark.parametrize(
+    ("row", "serial"),
+    [
+        (["Alat: MWD-22"], "MWD-22"), (["Alat", "MWD-22"], "MWD-22"), (["Nomor Seri: 1234"], "1234"),
+        (["No. Alat:", "77-A"], "77-A"), (["Alet: 4471"], "4471"), (["Cihaz: T-2209"], "T-2209"),
+        (["Cihaz No", "4471"], "4471"), (["Seri Numarası: A-17"], "A-17"),
+        (["Alat ukur: 12"], None), (["Cihaz sıcaklığı: 25"], None),
+    ],
+)  # fmt: skip
+def test_the_serial_stands_behind_the_word_for_the_tool_in_indonesian_and_turkish(row, serial):
+    assert titles([row]).metadata.get("serial") == serial

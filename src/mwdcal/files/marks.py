@@ -11,6 +11,9 @@ import unicodedata
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from datetime import date
+from functools import cache
+from itertools import pairwise
 from textwrap import shorten
 from typing import NamedTuple
 
@@ -19,12 +22,14 @@ import numpy as np
 
 from mwdcal.calibration.diagnosis.flags import listed
 from mwdcal.errors import Answer, InputError, QuestionError
+from mwdcal.files.depths import counts_stations
 from mwdcal.files.formats.columns import Column, looks_numeric, shown
 from mwdcal.files.formats.table import Table, labels, numbers, row_word
-from mwdcal.files.formats.titles import ADJUSTED, NOT_TO_USE, OF_REFUSAL
+from mwdcal.files.formats.titles import ADJUSTED, NOT_TO_USE, OF_REFUSAL, day_of
 from mwdcal.files.parting import check_rows, is_check, marked_rows
 from mwdcal.files.statements import rows_of
 from mwdcal.files.synonyms import OURS
+from mwdcal.geometry.vectors import Array
 from mwdcal.sensor.profile import TableFormat
 
 _REJECTED = re.compile(
@@ -85,6 +90,11 @@ _ACCEPTED = re.compile(
 )
 _REMARK_BEHIND = re.compile(r"\s*[(\[][^)\]]*[)\]]$|\s*[,;–-]\s+.*$")
 """A remark behind a judgement: ok (repeated)."""
+_OF_ORDER = re.compile(
+    r"\W*(start|begin(ning)?|end|anfang|beginn|ende|begynnelse|slutt|inicio|comienzo|fin(al)?|fim|debut|начало|конец|"
+    r"mulai|selesai|baslang[ıi]c|bitis|开始|结束)\W*"
+)
+"""Words for the first or the last row, which say nothing of its worth."""
 _OF_ACCEPTANCE = re.compile(
     r"(is )?(ok|valid|use|used|accept|accepted|good|gultig|gyldig|valid[oa]|годен|有效|io)\W*"
 )
@@ -107,13 +117,15 @@ _LONGEST_REMARK = 60
 """Letters of a remark that a sentence quotes."""
 _MARK_NUMBERS = frozenset("0123456789+-−–—eE.,:;/ ")
 _MOST_STATIONS = 2000
-"""Stations of a run beyond which no copies are looked for."""
+"""Stations of a run beyond which no copies, and no second run, are looked for."""
 _MOST_VALUES = 5
 """Values of a column of a status at most; one of more tells something else."""
 
 
 _NEAR, _RARE = 0.005, 0.2
 """A share of the range of a column within which numbers are near, and of rows that are near the next seldom."""
+_PAUSE = 30
+"""Days between two rows of a run at most."""
 UNMARKED = ("group", "serial", *OURS)
 """Columns of a run file that mark no row."""
 
@@ -225,7 +237,8 @@ def _verdicts(name: str, cells: Sequence[str]) -> dict[str, bool | None]:
     if judges and (accepted or named):
         usual = accepted or {max(sorted(different), key=cells.count)}
         verdicts |= dict.fromkeys(filled - usual - {*verdicts}, False)
-    remarks = {c for c in filled - accepted - {*verdicts} if not set(c) <= _MARK_NUMBERS}
+    others = filled - accepted - {*verdicts}
+    remarks = {c for c in others if not set(c) <= _MARK_NUMBERS and not _OF_ORDER.fullmatch(c)}
     few = 2 * sum(c in filled and c not in accepted for c in cells) < len(cells)
     return verdicts | (dict.fromkeys(remarks) if few else {})
 
@@ -360,6 +373,46 @@ def _check_one_run(table: Table, form: TableFormat) -> None:
                 "Which one is meant? The rows of the others are left out by leave_out in [table] of the tool profile.",
                 [Answer(text, arguments) for text, arguments in zip(left, pairs, strict=True)],
             )
+
+
+def second_run(table: Table) -> list[str]:
+    """A sentence on the row at which a run may end and another begin, if there is one.
+
+    There is a pause of more than a month, and the numbers of the stations begin again with the first one; without such
+    numbers any others do.
+    """
+    days = next(filter(None, (_days(table, name) for name in table.columns)), [])
+    starts = [k + 1 for k, (a, b) in enumerate(pairwise(days)) if abs(b - a).days > _PAUSE]
+    columns: dict[str, Array] = {}
+    for name in table.columns if starts else ():
+        with suppress(InputError):  # of text
+            columns[name] = numbers(table, name)
+    counts = {name: each for name, each in columns.items() if counts_stations(each)}
+    again = [
+        name
+        for name, each in (counts or columns).items()
+        if all(each[k - 1] != each[k] == each[0] for k in starts)
+    ]
+    if not again or (counts and len(again) < len(counts)):
+        return []
+    row = starts[0]
+    return [
+        f"{shown(again[0])} begins again at {place(table, row)}, and the date goes from {days[row - 1]} to "
+        f"{days[row]}. If these are two runs, write each to a file of its own, or leave the rows of one out by "
+        "leave_out in [table] of the tool profile."
+    ]
+
+
+def _days(table: Table, name: str) -> list[date]:
+    """The days of all rows in a column of dates, which may be written once for many rows; empty for any other."""
+    of_text = isinstance(table.columns[name], list) and table.count <= _MOST_STATIONS
+    cells = labels(table, name) if of_text else [""]
+    known, days = cache(day_of), list[str]()
+    for cell in cells:
+        days.append(known(cell) if cell or not days else days[-1])
+        if not days[-1]:
+            return []
+    return [*map(date.fromisoformat, days)]
 
 
 def _remarks(table: Table, marks: Marks) -> Iterator[str]:

@@ -55,7 +55,7 @@ from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, looks_numeric, plain_names, shown
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.formats.text import holds_numbers, is_formula
-from mwdcal.files.marks import UNMARKED, without_rejected
+from mwdcal.files.marks import UNMARKED, second_run, without_rejected
 from mwdcal.files.repeats import means, repeats
 from mwdcal.files.statements import stated_table
 from mwdcal.geometry.observables import OBSERVABLES
@@ -409,7 +409,8 @@ def station_table(table: Table, profile: Profile) -> Table:
     used = [n for n in table.columns if named.get(n, n) in UNMARKED]
     _check_names(table, sources)
     table = without_rejected(table, profile.table, used)
-    table = replace(table, remarks=(*table.remarks, *_absent_angles(table, sources)))
+    remarks = (*table.remarks, *second_run(table), *_absent_angles(table, sources))
+    table = replace(table, remarks=remarks)
     sets = repeats(table, sources)
     if sets is None:
         return table

@@ -57,6 +57,7 @@ from mwdcal.files.marks import (
     is_the_repeat,
     marks_in,
     place,
+    second_run,
     without_rejected,
 )
 from mwdcal.files.metadata import toml
@@ -403,7 +404,7 @@ class Proposal(NamedTuple):
 
 
 def propose(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Table,
     *,
     sheet: str = "",
     header_row: int = 0,
@@ -414,7 +415,7 @@ def propose(
     leave_out: Mapping[str, Sequence[str]] | None = None,
     keep: Mapping[str, Sequence[str]] | None = None,
 ) -> Proposal:
-    """The profile with which a table of stations at known attitudes is a calibration run.
+    """The profile with which a table of stations at known attitudes, a file or one in memory, is a calibration run.
 
     `sheet`, `header_row` and `decimal` say where the table is and how its numbers are written, `answers` which
     column holds what, or the number of a reference,
@@ -425,8 +426,7 @@ def propose(
         InputError: the file cannot be read, or is no table of stations.
         FitError: columns and units that names and readings leave open, or readings that no axes explain.
     """
-    where = tables.laid_out(path, sheet=sheet, header_row=header_row, decimal=decimal)
-    table, form = as_written(path, where, bool(sheet or header_row or decimal))
+    where, table, form = _table_of(path, sheet, header_row, decimal)
     given = stated_numbers(answers or {}, table.columns)
     names = {column: name for column, name in (answers or {}).items() if column not in given}
     stated = {**(stated or {}), **given}
@@ -435,7 +435,8 @@ def propose(
     place = {"header_line": header_row} if header_row else {}
     said = {**place, **(north or {}), "leave_out": leave_out or {}, "keep": keep or {}}
     form = _with(form, {key: value for key, value in said.items() if value not in ({}, None)})
-    with_answers = partial(_proposal, path, where, table, form, stated)
+    name = table.source if isinstance(path, Table) else Path(path).stem
+    with_answers = partial(_proposal, name, where, table, form, stated)
     again = partial(
         propose, path, sheet=sheet, header_row=header_row, decimal=decimal, answers=answers, stated=stated, north=north
     )  # fmt: skip
@@ -456,6 +457,16 @@ def propose(
         if by_readings := _answer_by_readings(error, with_answers, names, table):
             return by_readings
         raise
+
+
+def _table_of(
+    source: str | os.PathLike[str] | Table, sheet: str, header_row: int, decimal: str
+) -> tuple[Layout | None, Table, TableFormat | None]:
+    """Where the table of a file is, the table, and how it is written; the profile of one in memory looks for it."""
+    if isinstance(source, Table):
+        return None, source, TableFormat(find=True)
+    where = tables.laid_out(source, sheet=sheet, header_row=header_row, decimal=decimal)
+    return where, *as_written(source, where, bool(sheet or header_row or decimal))
 
 
 def _questions_of(error: QuestionError | QuestionsError) -> Sequence[QuestionError]:
@@ -527,7 +538,7 @@ _WITHOUT_RESULT = "its formulas have no value, as no spreadsheet program has sav
 
 
 def _proposal(
-    path: str | os.PathLike[str],
+    name: str,
     where: Layout | None,
     table: Table,
     form: TableFormat | None,
@@ -537,7 +548,7 @@ def _proposal(
     """The proposal for a table that was read, with what the user says of its columns."""
     whole = table
     table, form, columns, by_value, ignored = named_columns(table, form, where, answers)
-    if filled := _with_angles_filled(path, where, (table, whole), columns, form, stated, answers):
+    if filled := _with_angles_filled(name, where, (table, whole), columns, form, stated, answers):
         return filled
     _check_choices(where, {*columns, *table.metadata, *answers}, table.source)
     check_cells(table, columns)
@@ -547,6 +558,7 @@ def _proposal(
     form = _with(form, {"ignore": (*ignored, *denied)} if ignored or denied else {})
     columns |= _stacked_tools(table, columns, stated, answers)
     table = _of_one_tool(table, columns, stated)
+    table = replace(table, remarks=(*table.remarks, *second_run(table)))
     columns |= station_column(table, columns, answers)
     columns |= {c: ColumnSource(name=f"{stated[c]}") for c in _OF_THE_PLACE if c in stated}
     sets = repeats(table, columns)
@@ -555,10 +567,10 @@ def _proposal(
         table = means(table, columns, sets)
         if "group" in columns and len({*labels_of(table, columns["group"].name)}) < 2:
             del columns["group"]  # it tells the readings of a station apart
-    profile = Profile(name=Path(path).stem, table=form or msgspec.UNSET, columns=columns)
+    profile = Profile(name=name, table=form or msgspec.UNSET, columns=columns)
     said = {*answers, *stated}
     profile, readings, wirings, open_axes = _wired_and_checked(table, profile, by_value, said)
-    name, triads = str(readings.metadata.get("serial", Path(path).stem)), _triads(readings, wirings)
+    name, triads = str(readings.metadata.get("serial", name)), _triads(readings, wirings)
     profile = msgspec.structs.replace(profile, name=name, **triads)
     remarks = [*readings.remarks, *blank]
     if sets:
@@ -626,7 +638,7 @@ def named_columns(
     """
     formulas = [name for name in table.columns if _is_formulas(labels_of(table, name))]
     table = replace(table, columns={n: c for n, c in table.columns.items() if n not in formulas})
-    units_by_name = dict(zip(where.names, where.units, strict=True)) if where else {}
+    units_by_name = dict(zip(where.names, where.units, strict=True)) if where else table.units
     names = [*table.columns]
     units = [units_by_name.get(name, "") for name in names]
     above = where.above if where else ()
@@ -642,7 +654,7 @@ def named_columns(
 
 
 def _with_angles_filled(
-    path: str | os.PathLike[str],
+    name: str,
     where: Layout | None,
     pair: tuple[Table, Table],
     columns: Mapping[str, ColumnSource],
@@ -658,7 +670,7 @@ def _with_angles_filled(
     if once := once_for_setting(table, columns) or written_once(table, columns):
         form = _with(form, {"fill_down": once})
         with suppress(InputError, FitError):
-            proposal = _proposal(path, where, filled_down(whole, once), form, stated, answers)
+            proposal = _proposal(name, where, filled_down(whole, once), form, stated, answers)
             if _is_confirmed(proposal):
                 return proposal
     return None
@@ -672,6 +684,9 @@ def _wired_and_checked(
     columns = profile.columns
     try:
         profile, readings, wirings, open_axes = _wired_by_elevation(table, profile)
+    except InputError as error:
+        _check_exchanged(table, profile, answers, error)
+        raise
     except FitError:
         _ask_gons(table, {c: columns[c] for c in ANGLES_OF_STAND if c in by_value})
         _check_dip(table, profile, answers)
@@ -683,6 +698,31 @@ def _wired_and_checked(
     _check_magnetic(table, readings, wirings, columns)
     _check_repeats(table, columns, profile.form)
     return profile, readings, wirings, open_axes
+
+
+_FIT_EXCHANGED = "The readings fit with"
+"""The first words of the question on two angles that are exchanged."""
+
+
+def _check_exchanged(
+    table: Table, profile: Profile, answers: Collection[str], error: InputError
+) -> None:
+    """Ask whether the inclination is exchanged with another angle, where an error is gone and gravity fits then."""
+    columns = profile.columns or {}
+    inclination, *others = ANGLES_OF_STAND
+    for other in others:
+        if not {inclination, other} <= {*columns} - {*answers}:
+            continue
+        pair = {inclination: columns[other], other: columns[inclination]}
+        exchanged = msgspec.structs.replace(profile, columns={**columns, **pair})
+        result = None
+        with suppress(FitError, InputError):
+            result = _wired(table, exchanged)[2].get("accelerometer")
+        if result and result.unexplained < _CONFIRMED:
+            names = " and ".join(shown(columns[column].name) for column in pair)
+            said = tuple(("column", f"{column}={each.name}") for column, each in pair.items())
+            answer = Answer("they are exchanged", said)
+            raise QuestionError(f"{error} {_FIT_EXCHANGED} {names} exchanged.", [answer])
 
 
 def _is_formulas(cells: Sequence[str]) -> bool:
@@ -839,7 +879,9 @@ def _is_of_readings(answer: Answer, question: QuestionError) -> bool:
     Angles that the tool itself may have measured fit its readings whatever the stand shows, and the channels of each
     of several tools fit.
     """
-    if any(words in question.text for words in (MEASURED_BY_TOOL, OF_SEVERAL_TOOLS)):
+    if any(
+        words in question.text for words in (MEASURED_BY_TOOL, OF_SEVERAL_TOOLS, _FIT_EXCHANGED)
+    ):
         return False
     pairs = [text.partition("=") for argument, text in answer.arguments if argument == "column"]
     return len(pairs) == len(answer.arguments) and all(
@@ -890,7 +932,7 @@ def with_north(
 
 _WORDS_OF_TOOLS = re.compile(
     r"s[eé]rie|serial|s/?n\b|tool|probe|sond[ea]|ger[äa]t|instrument|equip|ferram|herram|verkt(ø|oe?)y|matr[ií]c|"
-    r"прибор|зонд|зав|仪器|探管|编号",
+    r"\balat\b|\balet\b|\bcihaz|прибор|зонд|зав|仪器|探管|编号",
     re.IGNORECASE,
 )
 """Words of a column that may tell several tools apart."""

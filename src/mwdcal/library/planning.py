@@ -20,7 +20,14 @@ from mwdcal.geometry.vectors import AnyArray
 from mwdcal.library.answers import Said, by_column
 from mwdcal.library.results import Result, arrays_of
 from mwdcal.library.shown import digest_of
-from mwdcal.library.tasks import NOMINAL, Tabular, loaded_profile, table_of, with_choices
+from mwdcal.library.tasks import (
+    NOMINAL,
+    Tabular,
+    loaded_profile,
+    table_in_memory,
+    table_of,
+    with_choices,
+)
 from mwdcal.sensor.profile import Profile
 
 if TYPE_CHECKING:
@@ -353,7 +360,7 @@ class ProposedProfile(Result):
 
 
 def propose_profile(
-    table_path: FilePath,
+    table_path: Tabular,
     *,
     sheet: str = "",
     header_row: int = 0,
@@ -367,11 +374,12 @@ def propose_profile(
     leave_out: Mapping[str, Sequence[str]] | Said | None = None,
     keep: Mapping[str, Sequence[str]] | Said | None = None,
 ) -> ProposedProfile:
-    """Propose a tool profile for a table as a laboratory keeps it: text or workbook, of any layout.
+    """Propose a tool profile for a table as a laboratory keeps it: text or workbook, of any layout, or a DataFrame.
 
     Definition: where the table is, how its numbers are written, the meaning and unit of each column, and, from
     readings at known attitudes, the axes and nominal scales of both triads. `read_run(table_path, proposed.profile)`
-    then takes the table as it is.
+    then takes the table as it is. A table of pandas or polars has its names as columns, and may have their units in
+    its first row; the profile finds the same names in files too.
 
     `sheet`, `header_row` (of the column names) and `decimal` ("." or ",") say what is open about the table, `column`
     which column holds what, by the name of the run file: {"ref_azimuth_deg": "Azi 2"}, with the unit in brackets
@@ -397,10 +405,13 @@ def propose_profile(
     """
     from mwdcal.identification.proposal import propose
 
-    if not isinstance(table_path, str | os.PathLike):
-        raise InputError(
-            f"`table_path` must be a file; got {type(table_path).__name__}. Write the table to one, such as by to_csv."
-        )
+    source: FilePath | Table
+    if isinstance(table_path, str | os.PathLike):
+        source, path = table_path, Path(table_path)
+    else:
+        source = table_in_memory(table_path, "table")
+        path = Path(source.source)
+        _check_only_of_files({"sheet": sheet, "header_row": header_row, "decimal": decimal})
     stated = {"serial": serial, "date": date}
     norths = {
         "azimuth_reference": north,
@@ -408,7 +419,7 @@ def propose_profile(
         "convergence_deg": convergence_deg,
     }
     proposal = propose(
-        table_path,
+        source,
         sheet=sheet,
         header_row=header_row,
         decimal=decimal,
@@ -418,4 +429,10 @@ def propose_profile(
         leave_out=by_column("leave_out", leave_out),
         keep=by_column("keep", keep),
     )
-    return ProposedProfile(proposal, Path(table_path))
+    return ProposedProfile(proposal, path)
+
+
+def _check_only_of_files(said: Mapping[str, object]) -> None:
+    """Refuse answers about the place and the writing of a table in a file, for one in memory."""
+    for name in (each for each, value in said.items() if value):
+        raise InputError(f"`{name}` is of tables in files; got a table in memory. Leave it out.")

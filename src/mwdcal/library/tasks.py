@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Literal, Protocol, Unpack, cast, runtime_checkable
@@ -112,11 +112,11 @@ def table_of(source: Tabular, name: str, read: Callable[[Path], Table]) -> Table
 
 
 def _name_of(key: object) -> str:
-    """The name of a column; one of a header of several rows is joined: ("MD", "m") is MD m."""
-    if not isinstance(key, tuple):
-        return str(key)
-    parts = (str(part) for part in key if not str(part).startswith("Unnamed: "))
-    return " ".join(filter(None, parts)) or str(key)
+    """The name of a column, with single blanks as of a file; of a header of several rows ("MD", "m") it is MD m."""
+    parts = [key]
+    if isinstance(key, tuple):
+        parts = [part for part in key if not str(part).startswith("Unnamed: ")]
+    return " ".join(" ".join(map(str, parts)).split()) or str(key)
 
 
 def table_in_memory(source: Any, name: str) -> Table:
@@ -126,6 +126,8 @@ def table_in_memory(source: Any, name: str) -> Table:
     names = getattr(
         source, "column_names", getattr(source, "columns", source)
     )  # of pyarrow, of pandas
+    if not isinstance(names, Iterable):
+        raise InputError(f"{name} must be a file or columns by name; got {type(source).__name__}.")
     columns = {_name_of(key): _column(_name_of(key), source[key]) for key in names}
     count = max(map(len, columns.values()), default=0)
     for key, column in columns.items():

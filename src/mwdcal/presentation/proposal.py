@@ -86,8 +86,9 @@ def screen(proposal: Proposal, run: Path, output: Path | None, has_roll_test: bo
     profile = proposal.profile
     head = [run.name, profile.name, plural(proposal.stations, "station")]
     blocks = ["   ".join(map(one_line, [*head, *simulated(proposal.metadata)]))]
-    if not isinstance(profile.table, msgspec.UnsetType):
-        blocks[0] += "\n" + _layout(proposal, profile.table, run)
+    form = profile.table
+    if not isinstance(form, msgspec.UnsetType) and (proposal.where or not form.find):
+        blocks[0] += "\n" + _layout(proposal, form, run)
     if not isinstance(profile.columns, msgspec.UnsetType):
         guesses = dict.fromkeys(proposal.by_value, ", by its values")
         rows = [

@@ -280,7 +280,7 @@ def laid_out(
         InputError: no such sheet, row or columns, or no table.
         FitError: two tables that may both be meant, or a decimal sign that the numbers leave open.
     """
-    every, covers, unread = _every(sheets, source, sheet, header_line, decimal)
+    every, covers, unread = _every(sheets, source, sheet, header_line, decimal, wanted)
     tables = [t for t in every if {*wanted} <= {*t.names}]
     tables = [t for t in tables if kind in ("", _kind_of(t))]
     if not tables:
@@ -300,6 +300,8 @@ def laid_out(
             best, [s for s in sheets if s.name != sheet], source, decimal
         )
         beside += others
+    if wanted and not sheet and not kind:
+        unread += _under_other_names(beside, wanted)
     best = replace(best, beside=tuple(beside), remarks=(*best.remarks, *unread))
     return _with_covers(best, covers)
 
@@ -317,7 +319,12 @@ def is_part_of(table: Layout, sheet: str, parts: Sequence[str], lines: Sequence[
 
 
 def _every(
-    sheets: Sequence[Sheet], source: str, sheet: str, header_line: int, decimal: str
+    sheets: Sequence[Sheet],
+    source: str,
+    sheet: str,
+    header_line: int,
+    decimal: str,
+    wanted: Collection[str] = (),
 ) -> tuple[list[Layout], list[Sheet], list[str]]:
     """The tables of all sheets or of one, of all header lines or of one; sheets without numbers; remarks."""
     candidates = [each for each in sheets if each.name == sheet] if sheet else list(sheets)
@@ -336,7 +343,7 @@ def _every(
         covers += [] if layouts or any(_is_reading(row) for _, row in each.rows) else [each]
         tables += [t for t in layouts if header_line in (0, t.form.header_line)]
     tables, unread = _of_shown_sheets(tables, {s.name for s in candidates if s.hidden})
-    return _with_same_stations(tables), covers, unread
+    return _with_same_stations(tables, wanted), covers, unread
 
 
 def _of_shown_sheets(
@@ -350,15 +357,18 @@ def _of_shown_sheets(
     return shown_ones, [f"the tables on hidden sheets are not read: {', '.join(unread)}."]
 
 
-def _with_same_stations(tables: Sequence[Layout]) -> list[Layout]:
-    """Tables, each with the channels that another sheet has of the same stations: of two triads on two sheets."""
+def _with_same_stations(tables: Sequence[Layout], wanted: Collection[str]) -> list[Layout]:
+    """Tables, each with the channels that another sheet has of the same stations: of two triads on two sheets.
+
+    A remark says where the columns that are `wanted` are all on one of them.
+    """
     joined: list[Layout] = []
     for table in _with_stand(tables):
         place = next((k for k, t in enumerate(joined) if _have_same_stations(t, table)), None)
         if place is None:
             joined.append(table)
         else:
-            joined[place] = _side_by_side(joined[place], table)
+            joined[place] = _side_by_side(joined[place], table, wanted)
     return joined
 
 
@@ -438,8 +448,14 @@ def _are_of_one_triad_each(one: Layout, other: Layout) -> bool:
     return min(len(names[0] & names[1]), *triads) >= LEAST_COLUMNS - 1
 
 
-def _side_by_side(one: Layout, other: Layout) -> Layout:
-    """A table with the columns of another sheet that it does not have."""
+_NO_PART = "are no part of this run. If they are the run, propose a tool profile for their sheet: mwdcal profile."
+"""The end of a remark on readings that are not taken as those of the profile."""
+
+
+def _side_by_side(one: Layout, other: Layout, wanted: Collection[str]) -> Layout:
+    """A table with the columns of another sheet that it does not have; the one with all `wanted` comes first."""
+    if wanted and {*wanted} <= {*other.names}:
+        one, other = other, one
     _, equal = _shared(one, other)
     more = [k for k, name in enumerate(other.names) if name not in equal]
     names = plain_headings([*one.names, *(other.names[k] for k in more)])
@@ -448,6 +464,8 @@ def _side_by_side(one: Layout, other: Layout) -> Layout:
         f"{' and '.join(places)} are one table: in all {len(one.lines)} rows they have "
         f"the same {', '.join(n for n in one.names if n in equal)}."
     )
+    if wanted and {*wanted} <= {*one.names}:
+        said = f"the channels are those of {places[0]}; those of {places[1]} at the same stations {_NO_PART}"
     return replace(
         one,
         names=names,
@@ -696,7 +714,7 @@ def _check_renamed(
 ) -> None:
     """Refuse a table as the run where one of the `others` is like it but for names of columns that are `wanted`."""
     for other in (t for t in others if not _kind_of(t) and len(t.lines) >= _BESIDES):
-        if not _share_columns(other, table):
+        if not _share_columns(other, table) and not _are_of_one_triad_each(other, table):
             continue
         absent = [shown(name) for name in wanted if name not in other.names]
         columns = "column" if len(absent) == 1 else "columns"
@@ -712,6 +730,16 @@ def _check_renamed(
         key = f'sheet = "{table.sheet}"' if on_sheets else f"header_line = {table.form.header_line}"
         text = f"{problem}; {there} has. If {here} is the run, {advice}; if {there} is, put {key} into its [table]."
         raise QuestionError(text, [])
+
+
+def _under_other_names(tables: Sequence[Layout], wanted: Collection[str]) -> list[str]:
+    """A remark on each of some tables that looks like a run, and has none of the channels that are `wanted`."""
+    return [
+        f"the {len(t.lines)} readings under other names on sheet {shown(t.sheet)} {_NO_PART}"
+        for t in tables
+        if t.sheet and not t.kind and len(t.lines) >= _BESIDES and {*wanted}.isdisjoint(t.names)
+        if _has_axes(t.names) and angles_among(t.names)
+    ]
 
 
 def _several(tables: Sequence[Layout], source: str, sheet: str) -> QuestionError:

@@ -31,6 +31,7 @@ _TITLE_WORDS = {
     "serie nserie seriennr geratenummer geratenr sondennummer sondennr serienummer "
     "serienr verktoynr instrumentnr numerodeserie nodeserie noserie nserie numeroserie nsserie numserie ndeserie "
     "matricola nrfabryczny numerfabryczny nrseryjny sondan sondano ferramentan ferramentano herramientan herramientano "
+    "nomorseri noseri nomoralat noalat serinumarası cihazserino aletserino "
     "製造番号 製造№ sarjanumero sarjano vyrobnicislo vyrc seriovecislo 일련번호 serino numardeserie serienummer "
     "заводской№ заводскойномер серийныйномер зав№ серийный№ прибор№ 序列号 编号 仪器编号 出厂编号",
     "date": "date testdate caldate calibrationdate measured datum prufdatum messdatum dato kalibreringsdato fecha "
@@ -104,7 +105,7 @@ _PARTS = re.compile(r"\s+/\s+|,\s+|;\s*|\s{3,}")
 """The separator of facts in one cell."""
 _OF_TOOLS = (
     "tool|probe|sensor|sonde|sonda|prüfling|instrument|herramienta|ferramenta|verktøy|gerät|equipo|equipamento|"
-    "прибор|зонд|датчик|инклинометр|仪器|探管"
+    "alat|alet|cihaz|прибор|зонд|датчик|инклинометр|仪器|探管"
 )
 _TOOL = re.compile(
     rf"#?\s*(?:(?:{_OF_TOOLS})(?:n?-|\s*)"
@@ -123,8 +124,8 @@ _WHOLE_SERIAL = rf"{_SERIAL.pattern}(?:\s+/\s+{_OF_TWO})?"
 """A serial, which may be of two numbers, a model and its own: BHX-72 / 0091. A day is not a number."""
 _TWO_NUMBERS = re.compile(rf"(?<!\S)({_OF_TWO})(\s+/|,)\s+(?={_OF_TWO}\s*$)")
 _NUMBER_OF_TOOL = re.compile(
-    r"(tool|probe|sensor|sonde|modul[eo]?|instrument|herramienta|ferramenta|equipo|equipamento|verktoy|gerat|прибор|зонд|датчик)"
-    r"(s|n|e|en)?(s/?n|n/s|serial(n|no|nr|num|number)?|n|no|nr|num|number|nummer|numero|№|номер|id)|"
+    r"(tool|probe|sensor|sonde|modul[eo]?|instrument|herramienta|ferramenta|equipo|equipamento|verktoy|gerat|alat|alet|cihaz|"
+    r"прибор|зонд|датчик)(s|n|e|en)?(s/?n|n/s|serial(n|no|nr|num|number)?|n|no|nr|num|number|nummer|numero|№|номер|id)|"
     r"(номер|numero|nummer|number|n|no|№)(d[eao]l?a?|of|der|des)?"
     r"(прибора|зонда|датчика|инклинометра|herramienta|ferramenta|equipo|equipamento|sonda|sonde|tool|probe)"
 )
