@@ -313,6 +313,11 @@ def test_a_profile_of_a_table_in_memory_is_that_of_its_file(library, tmp_path):
     assert (one.accelerometer, one.magnetometer) == (three.accelerometer, three.magnetometer)
 
 
+def test_names_that_differ_in_blanks_only_stay_two_columns():
+    table = table_in_memory({"Note": ["a"], "Note ": ["b"], "ax": [1.0]}, "run")
+    assert [*table.columns] == ["Note", "Note (2)", "ax"]
+
+
 def test_units_below_the_names_of_a_table_in_memory_are_its_columns_units():
     pandas = pytest.importorskip("pandas")
     columns = {name.split(" (")[0]: cells for name, cells in own_names().items()}

@@ -1103,7 +1103,8 @@ def test_an_angle_out_of_range_is_not_called_exchanged_where_the_readings_deny_i
         (["Alat: MWD-22"], "MWD-22"), (["Alat", "MWD-22"], "MWD-22"), (["Nomor Seri: 1234"], "1234"),
         (["No. Alat:", "77-A"], "77-A"), (["Alet: 4471"], "4471"), (["Cihaz: T-2209"], "T-2209"),
         (["Cihaz No", "4471"], "4471"), (["Seri Numarası: A-17"], "A-17"),
-        (["Alat ukur: 12"], None), (["Cihaz sıcaklığı: 25"], None),
+        (["Alat ukur: 12"], None), (["Cihaz sıcaklığı: 25"], None), (["Referans cihaz: X-9"], None),
+        (["Kalibrasyon cihazı: K-12"], None), (["Sonda de referencia: Q-5"], None), (["Referenzgerät: Q-5"], None),
     ],
 )  # fmt: skip
 def test_the_serial_stands_behind_the_word_for_the_tool_in_indonesian_and_turkish(row, serial):

@@ -25,7 +25,7 @@ from mwdcal.faults.diagnosis import diagnose as explain
 from mwdcal.files import documents, logs, profiles, runs, statements
 from mwdcal.files import metadata as meta
 from mwdcal.files.formats import table as tables
-from mwdcal.files.formats.columns import LABELS, Column, as_text
+from mwdcal.files.formats.columns import LABELS, Column, as_text, plain_headings
 from mwdcal.files.formats.table import Table
 from mwdcal.files.formats.titles import dated
 from mwdcal.files.limits import load_limits
@@ -128,7 +128,9 @@ def table_in_memory(source: Any, name: str) -> Table:
     )  # of pyarrow, of pandas
     if not isinstance(names, Iterable):
         raise InputError(f"{name} must be a file or columns by name; got {type(source).__name__}.")
-    columns = {_name_of(key): _column(_name_of(key), source[key]) for key in names}
+    keys = [*names]
+    called = plain_headings([_name_of(key) for key in keys])
+    columns = {each: _column(each, source[key]) for each, key in zip(called, keys, strict=True)}
     count = max(map(len, columns.values()), default=0)
     for key, column in columns.items():
         if len(column) != count:

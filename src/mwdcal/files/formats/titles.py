@@ -159,7 +159,7 @@ _WITH_MARK = re.compile(
 """A word of a serial number in a line, and the serial behind it."""
 _OF_EQUIPMENT = re.compile(
     r"stand|table|tisch|bench|banco|oven|ofen|chamber|thermo|logger|volt|multimeter|gauss|"
-    r"magnetom|theodol|reference|normal|"
+    r"magnetom|theodol|referen[cs]|referenz|referans|normal|patr[oó]n|étalon|acuan|(kalibrasyon|ölçüm)\s*$|"
     r"стенд|печь|эталон|转台|参考",
     re.IGNORECASE,
 )
@@ -341,7 +341,7 @@ def _tool(cell: str, right: Sequence[str]) -> str:
     marked = (m for m in _TOOL.finditer(f" {cell}") if m["mark"] and m[0][0].isspace())
     last = _TOOL.fullmatch(cell, max(cell.rfind(" "), cell.rfind("-")) + 1)
     match = _TOOL.match(cell) or last or next(marked, None)
-    if not match:
+    if not match or _OF_EQUIPMENT.search(match.string[: match.start()]):
         return ""
     behind = match.string[match.end() :].strip() or next((each for each in right[:2] if each), "")
     number = _SERIAL.match(behind)
