@@ -54,6 +54,7 @@ from mwdcal.files.contract import BlankReadingError as BlankReadingError
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, looks_numeric, plain_names, shown
 from mwdcal.files.formats.table import Table, labels
+from mwdcal.files.formats.titles import columns_of_a_day
 from mwdcal.files.formats.text import holds_numbers, is_formula
 from mwdcal.files.marks import UNMARKED, without_rejected
 from mwdcal.files.repeats import means, repeats
@@ -400,7 +401,7 @@ def run_table(table: Table, profile: Profile) -> Table:
 
 
 def station_table(table: Table, profile: Profile) -> Table:
-    """The rows of a run that its laboratory has not rejected; of an export with one row for each station.
+    """The rows of a run that its laboratory has not rejected, with one row for each station.
 
     Its `remarks` say which rows are left out, and of which the means are taken.
     """
@@ -413,7 +414,7 @@ def station_table(table: Table, profile: Profile) -> Table:
     sets = repeats(table, sources)
     if sets is None:
         return table
-    if not sources or sets.numbered:
+    if sets.numbered or not (sources or sets.labelled):
         return replace(table, remarks=(*table.remarks, sets.advice()))
     scales = {kind: getattr(profile, kind).scale for kind in CHANNELS}
     return replace(means(table, sources, sets), remarks=(*table.remarks, sets.sentence(scales)))
@@ -639,9 +640,7 @@ def to_readings(
         source=table.source,
         sheet=table.sheet,
         run_sha256=table.digest,
-        unused=synonyms.unused(
-            list(table.columns), {*COLUMNS, *COLUMN_OF_DAY.intersection(table.metadata)}
-        ),
+        unused=synonyms.unused(list(table.columns), {*COLUMNS, *_columns_of_day(table)}),
         remarks=table.remarks,
         self_scaled={
             kind: float(np.squeeze(scale))
@@ -655,6 +654,13 @@ def to_readings(
         for kind, scale in scales.items()
     }
     return readings, msgspec.structs.replace(profile, **triads)
+
+
+def _columns_of_day(table: Table) -> set[str]:
+    """The columns that give the day of the run, or agree with it."""
+    day = str(table.metadata.get("date", ""))
+    dated = columns_of_a_day(table.columns.items()) if day else ()
+    return {*COLUMN_OF_DAY.intersection(table.metadata), *(n for n, each in dated if each == day)}
 
 
 def check_references(table: Table, profile: Profile, kinds: list[str]) -> dict[str, Array]:
