@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import mwdcal as library
-from cli_support import RAW, channels, mwdcal, refused, stations, write_csv
+from cli_support import RAW, channels, mwdcal, stations, write_csv
 from mwdcal.files.formats.table import numbers
 from mwdcal.files.runs import read_export, run_table
 from mwdcal.sensor.profile import ColumnSource, Profile, StandProfile, TriadProfile

@@ -86,9 +86,9 @@ class Repeats:
     def advice(self) -> str:
         """The advice where the rows stay stations."""
         return (
-            f"every row counts as a station, and the stand angles are those of {self.counted()}. Readings of one setting "
-            "share its error and look like a drift. If they are such, average them: give the readings of a station one "
-            "label in the column `station`."
+            f"every row counts as a station, and the stand angles are those of {self.counted()}. Readings of one "
+            "setting share its error and look like a drift. If they are such, average them: give the readings of a "
+            "station one label in the column `station`."
         )
 
 

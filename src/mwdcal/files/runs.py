@@ -54,8 +54,8 @@ from mwdcal.files.contract import BlankReadingError as BlankReadingError
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, looks_numeric, plain_names, shown
 from mwdcal.files.formats.table import Table, labels
-from mwdcal.files.formats.titles import columns_of_a_day
 from mwdcal.files.formats.text import holds_numbers, is_formula
+from mwdcal.files.formats.titles import columns_of_a_day
 from mwdcal.files.marks import UNMARKED, without_rejected
 from mwdcal.files.repeats import means, repeats
 from mwdcal.files.statements import stated_table
