@@ -221,3 +221,14 @@ def test_the_day_behind_a_title_is_that_of_a_roll_test_only(tmp_path: Path, line
     """The day of the next check, or of a signature, is none of the measurement."""
     both = facts(tmp_path, A, ["", line])
     assert both[1][1] == ("2026-03-13" if line.startswith("Roll") else "2026-11-24")
+
+
+@pytest.mark.parametrize(("title", "kind"), [("Roll 90°", "roll test"), ("Calibration run", "")])
+def test_a_table_below_a_roll_test_is_one_too_unless_it_is_called_a_run(
+    tmp_path: Path, title: str, kind: str
+) -> None:
+    """The inclination alone of a second set does not make it the run."""
+    path = tmp_path / "two.csv"
+    lines = [*A, "Roll test 45°", NAMES, *FIRST, "", title, NAMES, *SECOND]
+    path.write_text("\n".join(lines) + "\n")
+    assert [t.kind for t in tables.every_table(path)] == ["roll test", kind]

@@ -157,6 +157,10 @@ _OF_ENTRY = re.compile(
     re.IGNORECASE,
 )
 """Words of a line that is no title of a check: of who has done it, or of the day of the next one."""
+_OF_RUN = re.compile(
+    r"(?<![^\W\d_])([ck]al|[ck]alib\w*|run|tumbl\w*|калибр\w*)(?![^\W\d_])|标定|校准", re.IGNORECASE
+)
+"""Words of the title of a calibration run."""
 ROLL_TEST = "roll test"
 """The kind of such a table."""
 _OF_SETTING = re.compile(
@@ -510,9 +514,10 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
 def _kind_of(table: Layout) -> str:
     """A void run or a roll test, by the sheet of a table and the title of its block; empty for a run.
 
-    The block of a table before it says so only of a table without one of its own.
+    The block of a table before it does not say so of one that is called a run.
     """
-    return _kind(f"{table.sheet} {table.title}", table.block or table.above)
+    above = table.block if _OF_RUN.search(table.title) else table.above
+    return _kind(f"{table.sheet} {table.title}", above)
 
 
 def _kind(words: str, above: Sequence[str] = ()) -> str:
@@ -1331,9 +1336,12 @@ def _table(sheet: Sheet, span: _Span, source: str, decimal: str) -> Layout | Non
 
 def _title(block: Block) -> str:
     """The line of a title block that says what its table is: the last one, or above facts of the tool the first one."""
-    first, last = (_line(block[k][1]) if block else "" for k in (0, -1))
-    is_entry = len([*filter(None, block[-1][1])]) > 1 if block else False
-    return first if is_entry and _is_of_check(first) and not OF_CHECKS.search(last) else last
+    if not block:
+        return ""
+    first, last = (_line(block[k][1]) for k in (0, -1))
+    is_title = _is_of_check(first) or _OF_RUN.match(first)
+    is_entry = len([*filter(None, block[-1][1])]) > 1
+    return first if is_entry and is_title and not OF_CHECKS.search(last) else last
 
 
 def _is_of_check(line: str) -> bool:
