@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import mwdcal as library
-from cli_support import RAW, channels, mwdcal, stations, write_csv
+from cli_support import RAW, channels, mwdcal, refused, stations, write_csv
 from mwdcal.files.formats.table import numbers
 from mwdcal.files.runs import read_export, run_table
 from mwdcal.sensor.profile import ColumnSource, Profile, StandProfile, TriadProfile
@@ -183,6 +183,13 @@ def test_rows_of_one_label_are_one_station_in_a_documented_run_file_too(tmp_path
     for kind in ("accelerometer", "magnetometer"):
         many, single = (getattr(fits[name], kind) for name in ("many", "single"))
         assert many.parameters == pytest.approx(single.parameters, rel=1e-9)
+
+
+def test_a_label_of_several_stations_excludes_none_of_them(tmp_path):
+    run, _ = repeated(readings=1)
+    run["station"] = np.repeat(np.arange(COUNT // 2), 2)
+    write_csv(tmp_path / "a.csv", run)
+    refused(mwdcal("calibrate", tmp_path / "a.csv", "-o", tmp_path / "d.json", "--exclude", 7), 2)
 
 
 @pytest.mark.parametrize("labels", [False, True])
