@@ -157,7 +157,7 @@ _OF_ENTRY = re.compile(
     re.IGNORECASE,
 )
 """Words of a line that is no title of a check: of who has done it, or of the day of the next one."""
-_OF_RUN = re.compile(
+_CALLED_RUN = re.compile(
     r"(?<![^\W\d_])([ck]al|[ck]alib\w*|run|tumbl\w*|калибр\w*)(?![^\W\d_])|标定|校准", re.IGNORECASE
 )
 """Words of the title of a calibration run."""
@@ -516,7 +516,7 @@ def _kind_of(table: Layout) -> str:
 
     The block of a table before it does not say so of one that is called a run.
     """
-    above = table.block if _OF_RUN.search(table.title) else table.above
+    above = table.block if _CALLED_RUN.search(table.title) else table.above
     return _kind(f"{table.sheet} {table.title}", above)
 
 
@@ -1339,7 +1339,7 @@ def _title(block: Block) -> str:
     if not block:
         return ""
     first, last = (_line(block[k][1]) for k in (0, -1))
-    is_title = _is_of_check(first) or _OF_RUN.match(first)
+    is_title = _is_of_check(first) or _CALLED_RUN.match(first)
     is_entry = len([*filter(None, block[-1][1])]) > 1
     return first if is_entry and is_title and not OF_CHECKS.search(last) else last
 
