@@ -11,7 +11,8 @@ def lines_of(page):
     text = (ROOT / page).read_text("utf-8")
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
     of_line = re.compile(r"^(\$ )?mwdcal (.*)\n((?:(?!\$ |mwdcal ).*\n)*)", re.MULTILINE)
-    runs = [run for language, block in blocks if not language for run in of_line.findall(block)]
+    joined = [re.sub(r"\\\n *", "", block) for language, block in blocks if not language]
+    runs = [run for block in joined for run in of_line.findall(block)]
     return [(line, shown.split("\n")[:-1] if dollar else None) for dollar, line, shown in runs]
 
 

@@ -1381,7 +1381,12 @@ def test_a_table_to_its_certificate(client, bench, tmp_path):
         patch.setattr("mwdcal.bench.documents.failure", None)
         assert client.get("/table").text == page
     assert drop(client, bench, "rolltest", "roll.csv", rolls).is_success
-    assert "PASS" in client.get("/table").text
+    assert "PASS<" in client.get("/table").text
+    cells = [line.split(b";") for line in rolls.splitlines()]
+    without_azimuth = b"\n".join(b";".join([*row[:9], *row[10:]]) for row in cells)
+    assert drop(client, bench, "rolltest", "part.csv", without_azimuth).is_success
+    assert "PASS (not judged: spread of azimuth, error of azimuth)<" in client.get("/table").text
+    assert drop(client, bench, "rolltest", "roll.csv", rolls).is_success
     assert on_table(client, bench, "certificate", number="C-7").is_success
     assert json.loads((folder / "certificate.json").read_text())["number"] == "C-7"
     assert client.get("/table/files/certificate.json").is_success

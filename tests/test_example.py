@@ -139,6 +139,11 @@ def test_the_next_commands_run_with_blanks_in_the_names_of_files(tmp_path, monke
     shutil.copy("my stand/demo (2)/export.csv", "my export.csv")
     calibrate = following("profile", "my export.csv", "-o", "my tool.toml")
     assert calibrate[:4] == ["calibrate", "my export.csv", "--tool", "my tool.toml"]
+    shutil.copy("my stand/demo (2)/tool.toml", "my servo.toml")
+    simulated = ("simulate", "--plan", "moosavi-12", "--tool", "my servo.toml", "-o", "my run.csv")
+    repeated = following(*simulated, "--truth", "t.json")
+    assert repeated[:4] == ["calibrate", "my run.csv", "--tool", "my servo.toml"]
+    assert mwdcal(*repeated).code == 0
     assert following(*calibrate)[:2] == ["verify", "my tool.json"]
     for tool in ((), ("--tool", "my export.csv")):
         message = refused(mwdcal("calibrate", "my export.csv", "-o", "x.json", *tool), 2)

@@ -94,3 +94,26 @@ def test_a_signed_certificate_replaces_nothing_that_it_lists_wherever_it_is(fold
     assert "it is a calibration" in said or "'C.json' lists it" in said
     assert (folder / name).read_bytes() == before
     assert mwdcal(*sign, "-o", folder / "signed.json").code == 0
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "better"),
+    [
+        ("calibrate", "e.jsn", "e.json"),
+        ("calibrate", "e.jsonn", "e.json"),
+        ("calibrate", "e.json.csv", "e.json.json"),
+        ("convert", "e.jsn", "e.json"),
+        ("sign", "e.jsn", "e.json"),
+        ("report", "e.hmtl", "e.html"),
+    ],
+)
+def test_a_misspelt_suffix_is_refused_with_the_right_one(folder, tmp_path, command, name, better):
+    said = refused(mwdcal(*commands(folder, tmp_path / name)[command]), 2)
+    assert f"Write to '{tmp_path / better}'." in said
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("name", ["e", "e.JSON", "e.json.new", "MWD 1.5"])
+def test_a_name_without_another_suffix_is_written(folder, tmp_path, name):
+    assert mwdcal(*commands(folder, tmp_path / name)["calibrate"]).code == 0
+    assert (tmp_path / name).exists()

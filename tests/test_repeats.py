@@ -166,13 +166,42 @@ def test_settings_written_once_and_rows_of_means_leave_the_stations_of_the_readi
         assert numbers(got, "ax") == pytest.approx(raw["ax"].mean(1), rel=1e-12)
 
 
-def test_a_row_of_a_documented_run_file_is_a_station_and_repeats_are_named(tmp_path):
+def test_rows_of_one_label_are_one_station_in_a_documented_run_file_too(tmp_path):
+    """Truth: the means by NumPy, written as a file of one row for each station, give the same calibration."""
     run, _ = repeated()
+    sets = {name: np.reshape(values, (COUNT, READINGS)) for name, values in run.items()}
+    single = {n: v.mean(1) if n in RAW else v[:, 0] for n, v in sets.items()}
+    fits = {}
+    for name, columns in (("many", run), ("single", single)):
+        write_csv(tmp_path / f"{name}.csv", columns)
+        fit = tmp_path / f"{name}.json"
+        ran = mwdcal("calibrate", tmp_path / f"{name}.csv", "--tool", "servo", "-o", fit)
+        fits[name] = library.load(fit)
+        means = "24 stations of 5 readings each: their means are taken; scatter of a reading "
+        assert (means in ran.err) == (name == "many")
+    assert fits["many"].stations == COUNT
+    for kind in ("accelerometer", "magnetometer"):
+        many, single = (getattr(fits[name], kind) for name in ("many", "single"))
+        assert many.parameters == pytest.approx(single.parameters, rel=1e-9)
+
+
+def test_a_label_of_several_stations_excludes_none_of_them(tmp_path):
+    run, _ = repeated(readings=1)
+    run["station"] = np.repeat(np.arange(COUNT // 2), 2)
     write_csv(tmp_path / "a.csv", run)
-    ran = mwdcal("calibrate", tmp_path / "a.csv", "--tool", "servo", "-o", tmp_path / "c.json")
-    assert "24 stations of 5 readings each" in ran.err
-    assert library.load(tmp_path / "c.json").stations == COUNT * READINGS
     refused(mwdcal("calibrate", tmp_path / "a.csv", "-o", tmp_path / "d.json", "--exclude", 7), 2)
+
+
+@pytest.mark.parametrize("labels", [False, True])
+def test_advice_for_rows_that_stay_stations_is_what_averages_them(labels):
+    run, _ = repeated()
+    one_label = run.pop("station")
+    numbered = {"station": np.arange(1, COUNT * READINGS + 1)} if labels else {}
+    got = library.read_run(run | numbered, "servo")
+    assert got.count == COUNT * READINGS
+    assert "one label in the column `station`" in got.remarks[0]
+    assert "profile" not in got.remarks[0]
+    assert library.read_run(run | {"station": one_label}, "servo").count == COUNT
 
 
 def test_angles_are_those_of_the_first_reading_or_the_mean_of_an_encoder():

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
 from pathlib import Path
 
+import numpy as np
+import openpyxl
 import pytest
 
+import mwdcal as library
+from cli_support import mwdcal
 from mwdcal.errors import InputError, QuestionError
 from mwdcal.files.formats import layout
 from mwdcal.files.formats import table as tables
+from simulation import DEG, Tool
+from simulation import plan as attitudes
 
 NAMES = "Inc,Azi,TF,Gx,Gy,Gz,Bx,By,Bz"
 FIRST = [f"{15 + k},{10 * k},{40 * k},0.1,0.2,0.9,1{k}00.5,{k}00.5,4836{k}.4" for k in range(9)]
@@ -195,3 +202,88 @@ def test_channels_of_two_sheets_are_joined_without_a_word_on_another_run() -> No
     two = with_names("Mag", "Inc,Azi,TF,Bx,By,Bz")
     (said,) = layout.laid_out([one, two], "w.xlsx", wanted=WANTED).remarks
     assert "'Acc' and 'Mag' are one table" in said
+
+
+TITLES = [
+    "Inclination (°)",
+    "Azimuth (°)",
+    "Toolface (°)",
+    *(f"{t}{a}" for t in "GB" for a in "xyz"),
+]
+FACTS: list[list[object]] = [["Tool", "DM-4471"], ["Serial no.", "DM-4471"], ["Date", "12.03.2026"]]
+
+
+def measured(seed: int, *angles: np.ndarray) -> list[list[object]]:
+    """The rows of a table of a simulated tool: its angles of the stand and readings."""
+    tool, rng = Tool.random(7), np.random.default_rng(seed)
+    clean = zip(tool.clean(*angles), tool.noise, strict=True)
+    readings = [each + sd * rng.normal(size=each.shape) for each, sd in clean]
+    return np.column_stack([*np.degrees(angles), *readings]).tolist()
+
+
+RUN = measured(1, *attitudes((5, 45, 90, 135), 6))
+ROLLS = measured(2, *(np.full(12, a * DEG) for a in (60, 30)), np.arange(12) * 30 * DEG)
+
+
+def written(path: Path, rows: list[list[object]]) -> Path:
+    """A workbook of these rows."""
+    book = openpyxl.Workbook()
+    for row in rows:
+        book.active.append(row)
+    book.save(path)
+    return path
+
+
+def beside(one: list[list[object]], other: list[list[object]]) -> list[list[object]]:
+    """Two tables side by side, with a blank column between them."""
+    wide = zip_longest(one, other, fillvalue=[])
+    return [[*row, *[None] * (len(TITLES) + 1 - len(row)), *behind] for row, behind in wide]
+
+
+@pytest.mark.parametrize("place", ["below", "beside"])
+@pytest.mark.parametrize(
+    ("first", "second", "day"),
+    [
+        ([*FACTS, ["Roll test"]], [["Calibration run"]], "2026-03-12"),
+        ([*FACTS, ["Roll test 13.03.2026"]], [["Calibration run"]], "2026-03-13"),
+        ([["Verification"], *FACTS], [["Calibration"], *FACTS], "2026-03-12"),
+        ([["Roll test 13.03.2026"], *FACTS], [["Calibration"], *FACTS], "2026-03-13"),
+    ],
+)
+def test_a_roll_test_above_or_beside_the_run_is_known_by_the_title_of_its_block(
+    tmp_path: Path, place: str, first: list[list[object]], second: list[list[object]], day: str
+) -> None:
+    """The run has 24 stations, the roll test 12: no question which is which, whatever comes first."""
+    high = max(len(first), len(second)) if place == "beside" else 0
+    tables = [
+        [*[[]] * (high - len(block)), *block, TITLES, *rows]
+        for block, rows in ((first, ROLLS), (second, RUN))
+    ]
+    rows = beside(*tables) if place == "beside" else [*tables[0], [], *tables[1]]
+    path, tool, fit = written(tmp_path / "w.xlsx", rows), tmp_path / "t.toml", tmp_path / "c.json"
+    for words in (("profile", path, "-o", tool), ("calibrate", path, "--tool", tool, "-o", fit)):
+        assert mwdcal(*words).code == 0
+    calibration = library.load(fit)
+    assert (calibration.stations, calibration.tool["date"]) == (len(RUN), "2026-03-12")
+    judged = mwdcal("verify", fit, path, "--json").json
+    assert (judged["stations"], judged["date"]) == (len(ROLLS), day)
+
+
+@pytest.mark.parametrize(
+    "line", ["Roll test 13.03.2026", "Check due 13.03.2026", "Verified 13.03.2026"]
+)
+def test_the_day_behind_a_title_is_that_of_a_roll_test_only(tmp_path: Path, line: str) -> None:
+    """The day of the next check, or of a signature, is none of the measurement."""
+    both = facts(tmp_path, A, ["", line])
+    assert both[1][1] == ("2026-03-13" if line.startswith("Roll") else "2026-11-24")
+
+
+@pytest.mark.parametrize(("title", "kind"), [("Roll 90°", "roll test"), ("Calibration run", "")])
+def test_a_table_below_a_roll_test_is_one_too_unless_it_is_called_a_run(
+    tmp_path: Path, title: str, kind: str
+) -> None:
+    """The inclination alone of a second set does not make it the run."""
+    path = tmp_path / "two.csv"
+    lines = [*A, "Roll test 45°", NAMES, *FIRST, "", title, NAMES, *SECOND]
+    path.write_text("\n".join(lines) + "\n")
+    assert [t.kind for t in tables.every_table(path)] == ["roll test", kind]

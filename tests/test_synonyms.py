@@ -227,6 +227,24 @@ def test_unused_columns_are_listed_by_calibrate_verify_and_compare(tmp_path, cal
     assert (said.out + said.err).count(wanted) == 1
 
 
+@pytest.mark.parametrize(
+    ("cells", "used"),
+    [
+        ([f"2026-03-13 10:{k:02d}:00" for k in range(48)], True),
+        ([f"13.03.2026 10:{k:02d}" for k in range(48)], True),
+        ([f"10:{k:02d}:00" for k in range(48)], False),
+        ([f"2026-03-{13 + k % 2} 10:00:00" for k in range(48)], False),
+    ],
+)
+@pytest.mark.parametrize("name", ["time", "datetime"])
+def test_a_column_of_times_that_gave_the_day_of_the_run_is_used(tmp_path, name, cells, used):
+    run, made = write_csv(tmp_path / "run.csv", {**servo_run(), name: cells}), tmp_path / "cal.json"
+    ran = mwdcal("calibrate", run, "--tool", "servo", "-o", made, "--json")
+    assert ran.code == 0, ran.err
+    assert (json.loads(made.read_bytes())["tool"].get("date") == "2026-03-13") == used
+    assert ("columns not used" not in ran.err) == used
+
+
 def test_a_table_of_the_contract_alone_has_no_such_finding(tmp_path):
     run = write_csv(tmp_path / "run.csv", servo_run())
     ran = mwdcal("calibrate", run, "--tool", "servo", "-o", tmp_path / "cal.json", "--json")

@@ -19,7 +19,7 @@ from mwdcal.files.profiles import built_in
 from mwdcal.geometry.observables import TITLES
 from mwdcal.presentation.numbers import capital, fixed, number, quantity, signed
 from mwdcal.presentation.text import one_line
-from mwdcal.presentation.verification import noise_free
+from mwdcal.presentation.verification import noise_free, outcome_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
     from mwdcal.calibration.record import ErrorRow
-    from mwdcal.use.verification import VerdictRow
+    from mwdcal.use.verification import Verdict, VerdictRow
 
 SHOWN_ANGLES = ("inclination", "toolface", "azimuth")
 """In the order in which a stand is set."""
@@ -223,10 +223,15 @@ def _heading(session: BenchSession) -> tuple[str, str]:
     """The result, if there is one, and how it is drawn."""
     t = texts()
     if session.verdict is not None:
-        return (t["passed"], "pass") if session.verdict.passed else (t["failed"], "fail")
+        return verdict_heading(session.verdict)
     if session.calibrated:
         return t["calibrated"].format(serial=session.facts.get("serial", "")), ""
     return "", ""
+
+
+def verdict_heading(verdict: Verdict) -> tuple[str, str]:
+    """The verdict of a roll test, with the limits that it does not cover, and how it is drawn."""
+    return outcome_of(verdict.passed, verdict.not_judged), "pass" if verdict.passed else "fail"
 
 
 def _order_text(session: BenchSession) -> str:

@@ -94,7 +94,7 @@ def _results(table: DroppedTable) -> dict[str, Any]:
     t, fit, verdict = pages.texts(), table.fit or RunFit(), table.verdict
     heading, style = "", ""
     if verdict is not None:
-        heading, style = (t["passed"], "pass") if verdict.passed else (t["failed"], "fail")
+        heading, style = pages.verdict_heading(verdict)
     elif fit.calibration is not None:
         heading = t["calibrated"].format(serial=table.serial)
     failure = table.failure

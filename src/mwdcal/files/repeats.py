@@ -1,9 +1,9 @@
 """Rows that are readings of one station: their means are the station.
 
 Readings at one setting of the stand share its error. As stations of their own they would count it again and again, and
-their residuals, alike from row to row, would look like a drift. A row of a documented run file is a station; in a
-table that is read through a tool profile, rows that follow each other are readings of one where label and stand are
-the same. Without labels they are where most of them come in sets at equal angles.
+their residuals, alike from row to row, would look like a drift. Rows that follow each other are readings of one
+station where label and stand are the same. In a table that is read through a tool profile rows without labels are too,
+where most of them come in sets at equal angles; in a documented run file each of these is a station.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from mwdcal.calibration.readings import ONE_SETTING, SOAK_GAP
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.files import synonyms
-from mwdcal.files.contract import CHANNELS, RAW, REFERENCES, is_angle
+from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, is_angle
 from mwdcal.files.formats.columns import LABELS, Column
 from mwdcal.files.formats.table import Table, labels, numbers
 from mwdcal.files.statements import rows_of
@@ -85,15 +85,10 @@ class Repeats:
 
     def advice(self) -> str:
         """The advice where the rows stay stations."""
-        how = (
-            "give the readings of a station one label in the column `station`, and read the table through a tool "
-            "profile (mwdcal profile)"
-            if self.numbered or not self.labelled
-            else "read the table through a tool profile (mwdcal profile)"
-        )
         return (
-            f"every row counts as a station, and label or stand angles are those of {self.counted()}. Readings of one "
-            f"setting share its error and look like a drift. If they are such, average them: {how}."
+            f"every row counts as a station, and the stand angles are those of {self.counted()}. Readings of one "
+            "setting share its error and look like a drift. If they are such, average them: give the readings of a "
+            "station one label in the column `station`."
         )
 
 
@@ -304,7 +299,7 @@ def means(table: Table, sources: Mapping[str, ColumnSource], sets: Repeats) -> T
     columns: dict[str, Column] = dict(first.columns)
     for name, cells in table.columns.items():
         column = ours.get(name, name)
-        if column in LABELS or (isinstance(cells, list) and name not in ours):
+        if column in LABELS or (isinstance(cells, list) and column not in MAPPED):
             continue
         columns[name] = _mean_column(column, numbers(table, name), sources, sets)
     return replace(first, columns=columns)

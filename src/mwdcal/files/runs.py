@@ -55,6 +55,7 @@ from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, Column, looks_numeric, plain_names, shown
 from mwdcal.files.formats.table import Table, labels
 from mwdcal.files.formats.text import holds_numbers, is_formula
+from mwdcal.files.formats.titles import columns_of_a_day
 from mwdcal.files.marks import UNMARKED, second_run, without_rejected
 from mwdcal.files.repeats import means, repeats
 from mwdcal.files.statements import stated_table
@@ -400,7 +401,7 @@ def run_table(table: Table, profile: Profile) -> Table:
 
 
 def station_table(table: Table, profile: Profile) -> Table:
-    """The rows of a run that its laboratory has not rejected; of an export with one row for each station.
+    """The rows of a run that its laboratory has not rejected, with one row for each station.
 
     Its `remarks` say which rows are left out, and of which the means are taken.
     """
@@ -414,7 +415,7 @@ def station_table(table: Table, profile: Profile) -> Table:
     sets = repeats(table, sources)
     if sets is None:
         return table
-    if not sources or sets.numbered:
+    if sets.numbered or not (sources or sets.labelled):
         return replace(table, remarks=(*table.remarks, sets.advice()))
     scales = {kind: getattr(profile, kind).scale for kind in CHANNELS}
     return replace(means(table, sources, sets), remarks=(*table.remarks, sets.sentence(scales)))
@@ -640,9 +641,7 @@ def to_readings(
         source=table.source,
         sheet=table.sheet,
         run_sha256=table.digest,
-        unused=synonyms.unused(
-            list(table.columns), {*COLUMNS, *COLUMN_OF_DAY.intersection(table.metadata)}
-        ),
+        unused=synonyms.unused(list(table.columns), {*COLUMNS, *_columns_of_day(table)}),
         remarks=table.remarks,
         self_scaled={
             kind: float(np.squeeze(scale))
@@ -656,6 +655,13 @@ def to_readings(
         for kind, scale in scales.items()
     }
     return readings, msgspec.structs.replace(profile, **triads)
+
+
+def _columns_of_day(table: Table) -> set[str]:
+    """The columns that give the day of the run, or agree with it."""
+    day = str(table.metadata.get("date", ""))
+    dated = columns_of_a_day(table.columns.items()) if day else ()
+    return {*COLUMN_OF_DAY.intersection(table.metadata), *(n for n, each in dated if each == day)}
 
 
 def check_references(table: Table, profile: Profile, kinds: list[str]) -> dict[str, Array]:

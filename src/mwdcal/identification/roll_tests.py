@@ -174,7 +174,8 @@ def _others(path: str | os.PathLike[str], run: Table, profile: Profile, said: Sa
     """The tables in the file of a run beside it."""
     every = tables.every_table(path, decimal=sign_of(profile, said))
     sheet = run.sheet or next((each.sheet for each in every), "")
-    return [t for t in every if not is_part_of(t, sheet, run.parts, run.lines)]
+    rows = (sheet, run.parts, run.lines, run.places.values())
+    return [t for t in every if not is_part_of(t, *rows)]
 
 
 def sign_of(profile: Profile, said: Said) -> str:

@@ -49,11 +49,12 @@ if TYPE_CHECKING:
 class SimulatedReadings(Readings, Result):
     """The readings of a simulated run, and its `truth`: what the command's truth file holds.
 
-    `run_table` is the run as its file has it.
+    `run_table` is the run as its file has it, `tool_name` the name or path of the tool profile, if it has one.
     """
 
     truth: dict[str, Any] = field(default_factory=dict)
     run_table: Table = field(default_factory=lambda: Table({}))
+    tool_name: str = ""
 
     def save(self, path: FilePath, truth: FilePath | None = None) -> None:
         """Write the run (CSV, TSV, Parquet or XLSX) and, where it is named, the truth (JSON): both or none.
@@ -77,7 +78,7 @@ class SimulatedReadings(Readings, Result):
     def _text(self) -> str:
         from mwdcal.presentation.simulation import screen
 
-        return screen(self.truth)
+        return screen(self.truth, self.tool_name)
 
     def _document(self) -> dict[str, Any]:
         return dict(self.truth)
@@ -320,6 +321,7 @@ class _Scene:
     digests: dict[str, str]
     record: Calibration | None = None
     tool: Truth | None = None
+    tool_name: str = ""
 
     @classmethod
     def of(
@@ -343,7 +345,8 @@ class _Scene:
             profile, digests["profile"] = profile_of(tool)
             if isinstance(tool, Calibration):
                 table = at_place_of(table, tool)
-            return cls(table, profile, physics, digests)
+            name = os.fspath(tool) if isinstance(tool, str | os.PathLike) else ""
+            return cls(table, profile, physics, digests, tool_name=name)
         if tool is not None:
             raise InputError(
                 "`calibration` brings its own profile and order. Leave out `tool` and `order`."
@@ -387,8 +390,9 @@ def _run(
     read |= {"profile": profile, "profile_sha256": scene.digests.get("profile", "")}
     read |= {"table": arrays_of(table)}
     return SimulatedReadings(
-        **read, truth=document(session, facts, scene.digests, serial), run_table=table
-    )
+        **read, truth=document(session, facts, scene.digests, serial), run_table=table,
+        tool_name=scene.tool_name,
+    )  # fmt: skip
 
 
 def _repeated(

@@ -93,8 +93,8 @@ def document(
     return json_document("simulate", content, labels, **digests)
 
 
-def screen(document: Mapping[str, Any]) -> str:
-    """A single run for people."""
+def screen(document: Mapping[str, Any], tool: str = "") -> str:
+    """A single run for people; `tool` is the name or path of its tool profile."""
     head = [
         document["tool"], document["serial"], document["plan"], plural(len(document["stations"]), "station"),
         f"order {document['order']}", f"seed {document['seed']}", SIMULATED,
@@ -111,9 +111,8 @@ def screen(document: Mapping[str, Any]) -> str:
     )
     blocks = [one_line("   ".join(head)), errors]
     if document["output"]:
-        follow = (
-            f"next: mwdcal calibrate {shell_word(document['output'])} --tool TOOL.toml -o CAL.json"
-        )
+        run, profile = shell_word(document["output"]), shell_word(tool) if tool else "TOOL.toml"
+        follow = f"next: mwdcal calibrate {run} --tool {profile} -o CAL.json"
         files = files_written(run=document["output"], truth=document["truth"])
         blocks.append(f"{files}   {one_line(follow)}")
     return "\n\n".join(blocks)

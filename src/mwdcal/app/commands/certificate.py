@@ -181,7 +181,7 @@ def sign(document: Path, key: Path, output: Path | None, replace: bool, as_json:
     from mwdcal.app.commands.certificate_keys import known
     from mwdcal.library.papers import sign
 
-    options.check_outputs([output], [document, key])
+    options.check_outputs([output], [document, key], form=".json")
     result = sign(document, key, output=output, replace=replace, passphrase=known)
     print_result(result.to_dict() if as_json else result.summary(), result.findings)
 

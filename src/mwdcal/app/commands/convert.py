@@ -98,7 +98,7 @@ def _convert(
     from mwdcal.files.formats import atomic
     from mwdcal.presentation import conversion
 
-    options.check_outputs([output], [calibration])
+    options.check_outputs([output], [calibration], form=".json")
     converted = conversion.converted(calibration, notation, _temperature(temperature))
     document = conversion.document(converted)
     shown = f"wrote {one_line(output)}" if output else conversion.screen(converted)
@@ -132,7 +132,7 @@ def _write_model(
     from mwdcal.files.formats import atomic
     from mwdcal.presentation import conversion
 
-    options.check_outputs([output], [calibration])
+    options.check_outputs([output], [calibration], form=".json")
     at = _temperature(temperature)
     converted, terms, model = conversion.terms_at(calibration, at, toolface)
     atomic.write(output, model)

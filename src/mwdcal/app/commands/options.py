@@ -397,10 +397,12 @@ KNOWN_SUFFIXES = (
 
 
 def _check_forms(paths: Iterable[Path | None], form: str) -> None:
-    """Refuse the suffix of another form than what is written."""
+    """Refuse the suffix of another form than what is written, known or misspelt; behind its own, .new may stand."""
     for path in filter(None, paths if form else ()):
-        suffix = path.suffix.lower()
-        if suffix in KNOWN_SUFFIXES and not suffix.startswith(form[:4]):
+        *before, suffix = ["", *(each.lower() for each in path.suffixes)]
+        names_form = suffix.startswith(form[:4]) and suffix in KNOWN_SUFFIXES
+        stands_behind = form in before and suffix not in KNOWN_SUFFIXES
+        if suffix[1:2].isalpha() and not (names_form or stands_behind):
             why = f"it would hold {form[1:].upper()}, and its suffix says otherwise"
             raise _refused(path, why, path.with_suffix(form))
 

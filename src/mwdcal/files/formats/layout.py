@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import groupby, pairwise, zip_longest
+from itertools import groupby, pairwise, takewhile, zip_longest
 from operator import eq
 from typing import Any, NamedTuple
 
@@ -44,6 +44,7 @@ from mwdcal.files.formats.titles import (
     OF_REFUSAL,
     Titles,
     dated,
+    day_of,
     titles,
     tool_in,
 )
@@ -151,6 +152,15 @@ _OF_DONE = re.compile(
     re.IGNORECASE,
 )
 """Words of what was done between two rows."""
+_OF_ENTRY = re.compile(
+    rf"{_OF_DONE.pattern}|[:：=]|(?<![^\W\d_])(due|next|until|expir\w*|validity|fällig\w*|bis|neste|pr[oó]xim\w*|до)(?![^\W\d_])",
+    re.IGNORECASE,
+)
+"""Words of a line that is no title of a check: of who has done it, or of the day of the next one."""
+_CALLED_RUN = re.compile(
+    r"(?<![^\W\d_])([ck]al|[ck]alib\w*|run|tumbl\w*|калибр\w*)(?![^\W\d_])|标定|校准", re.IGNORECASE
+)
+"""Words of the title of a calibration run."""
 ROLL_TEST = "roll test"
 """The kind of such a table."""
 _OF_SETTING = re.compile(
@@ -221,7 +231,8 @@ class Layout:
 
     `form` says how the table is written, `cells` are text, numbers in it with a decimal point, and `texts` the same
     as they stand there; `fractions` are columns of a workbook with numbers that are not whole. `left_out` are lines
-    below the names that are no readings, `above` the texts above them;
+    below the names that are no readings, `above` the texts above them,
+    `block` those of its own title block, and `title` the one that says what it is;
     `parts` the sheet of each row where several are one table; `heading` the text right above the names;
     `titles` what the title block says of the tool, the day and the place; `places` letters of the columns in a
     workbook; `remarks` are sentences on what is taken from other places than the columns. Of a table that goes `across`
@@ -243,6 +254,8 @@ class Layout:
     left_out: tuple[tuple[int, str], ...] = ()
     places: Mapping[str, str] = field(default_factory=dict)
     parts: tuple[str, ...] = ()
+    block: tuple[str, ...] = ()
+    title: str = ""
     heading: str = ""
     remarks: tuple[str, ...] = ()
     across: bool = False
@@ -294,7 +307,8 @@ def laid_out(
         if run is None:
             raise _several(alike, source, sheet)
         best = run
-    beside = [t for t in every if not is_part_of(t, best.sheet, best.parts, best.lines)]
+    rows = (best.sheet, best.parts, best.lines, best.places.values())
+    beside = [t for t in every if not is_part_of(t, *rows)]
     if sheet:
         best, others = _beside_other_sheets(
             best, [s for s in sheets if s.name != sheet], source, decimal
@@ -311,11 +325,17 @@ def every_table(sheets: Sequence[Sheet], source: str, decimal: str = "") -> list
     return _every(sheets, source, "", 0, decimal)[0]
 
 
-def is_part_of(table: Layout, sheet: str, parts: Sequence[str], lines: Sequence[int]) -> bool:
-    """Whether a table is that of a run in some lines of a sheet, or one of its `parts` on several sheets."""
-    return (table.sheet, table.lines[0]) in {
-        *zip(parts or [sheet] * len(lines), lines, strict=True)
-    }
+def is_part_of(
+    table: Layout,
+    sheet: str,
+    parts: Sequence[str],
+    lines: Sequence[int],
+    places: Collection[str],
+) -> bool:
+    """Whether a table is that of a run in some lines and columns of a sheet, or one of its `parts` on sheets."""
+    rows = {*zip(parts or [sheet] * len(lines), lines, strict=True)}
+    apart = places and table.places and {*table.places.values()}.isdisjoint(places)
+    return (table.sheet, table.lines[0]) in rows and not apart
 
 
 def _every(
@@ -333,7 +353,8 @@ def _every(
         raise InputError(f"{source}: there is no sheet {shown(sheet)}. The sheets are {names}.")
     tables, covers = [], []
     for each in sheets:
-        layouts = list(_tables(each, source, decimal)) if each in candidates else []
+        parts = _side_by_side_parts(each) if each in candidates else []
+        layouts = [t for part in parts for t in _tables(part, source, decimal)]
         across = not any(_has_axes(t.names) for t in layouts)
         if each in candidates and across and (turned := _turned(each)):
             layouts = [
@@ -509,8 +530,12 @@ def _the_run(tables: Sequence[Layout]) -> Layout | None:
 
 
 def _kind_of(table: Layout) -> str:
-    """A void run or a roll test, by the sheet of a table and the line above it; empty for a run."""
-    return _kind(f"{table.sheet} {table.heading}", table.above)
+    """A void run or a roll test, by the sheet of a table and the title of its block; empty for a run.
+
+    The block of a table before it does not say so of one that is called a run.
+    """
+    above = table.block if _CALLED_RUN.search(table.title) else table.above
+    return _kind(f"{table.sheet} {table.title}", above)
 
 
 def _kind(words: str, above: Sequence[str] = ()) -> str:
@@ -795,13 +820,63 @@ def _tables(sheet: Sheet, source: str, decimal: str) -> Iterator[Layout]:
             layout = replace(
                 layout,
                 left_out=tuple(sorted([*layout.left_out, *void])),
-                above=(*layout.above, *(" ".join(map(as_text, row)).strip() for _, row in under)),
+                above=(*layout.above, *(_line(row) for _, row in under)),
+                block=tuple(_line(row) for _, row in [*above[0], *under]),
+                title=_title(above[0]),
             )
             between = [*under, *rows[head + 1 : end]]
             near = [*rows[max(0, head - 4) : head], *between]
             layout = _with_settings(_with_warmth_of_lines(layout, between), near)
             layout = _with_serials(layout, near)
             yield _with_triads_beside(_with_triad_above(_with_rows_of_headings(layout)))
+
+
+def _side_by_side_parts(sheet: Sheet) -> list[Sheet]:
+    """A run and its check side by side in a workbook, in columns apart by a blank one; else the whole sheet.
+
+    All begin with a column of the same name, and the title of one is that of a check. Facts of the tool above one of
+    them hold for those without.
+    """
+    rows = sheet.rows
+    heads = (k for k, (a, b) in enumerate(pairwise(rows)) if _is_reading(b[1]) > _is_reading(a[1]))
+    head = next(heads, 0) if sheet.name else 0
+    names = _spelling(rows[head - is_units(rows[head][1])][1]) if head else []
+    blank = {
+        k
+        for k in range(len(names))
+        if not any(as_text(c) for _, row in rows for c in row[k : k + 1])
+    }
+    first = next(filter(None, names), "")
+    starts = [k for k, name in enumerate(names) if name == first and k - 1 in blank]
+    if not starts or names.index(first) in starts[:1]:
+        return [sheet]
+    ends = pairwise([0, *starts, max(len(row) for _, row in rows)])
+    parts = [_in_columns(sheet, *each) for each in ends]
+    blocks = [[row for row in part.rows if row[0] < rows[head][0]] for part in parts]
+    checks = [bool(OF_CHECKS.search(_title(block))) for block in blocks]
+    if not any(checks) or all(checks):
+        return [sheet]
+    stated = [row for block in blocks for row in block if _facts([row])]
+    stated = [row for row in stated if not _is_of_check(_line(row[1]))]
+    return [
+        part if _facts(block) else part._replace(rows=[*stated, *part.rows])
+        for part, block in zip(parts, blocks, strict=True)
+    ]
+
+
+def _in_columns(sheet: Sheet, start: int, end: int) -> Sheet:
+    """The part of a sheet in some columns."""
+    rows = [(line, row[start:end]) for line, row in sheet.rows]
+    merged = [
+        ((top, one - start), (bottom, other - start))
+        for (top, one), (bottom, other) in sheet.merged
+        if start <= one and other < end
+    ]
+    return sheet._replace(
+        rows=[row for row in rows if any(cell != "" for cell in row[1])],
+        merged=merged,
+        first_column=sheet.first_column + start,
+    )
 
 
 def _with_side_blocks_above(rows: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
@@ -1060,8 +1135,7 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     between = [
         " ".join(map(as_text, row)) for _, row in rows[heads[-1] : place] if not _is_reading(row)
     ]
-    of_check = heads[-1] and OF_CHECKS.search(_text(rows[heads[-1] - 1][1]))
-    if (of_check and between[1:]) or any(
+    if (_is_below_check(rows[: heads[-1]]) and between[1:]) or any(
         ADJUSTED.search(text) or OF_CHECKS.search(text) for text in between[1:]
     ):
         return True
@@ -1076,6 +1150,12 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     stated = [_tools_in(rows[start:end]) for start, end in pairwise([0, *heads])]
     ours = next(filter(None, stated[::-1]), set())
     return bool(_tools_in(block) - ours)
+
+
+def _is_below_check(rows: Sequence[tuple[int, Cells]]) -> bool:
+    """Whether the last of some rows, or the title block that ends with it, has the title of a check."""
+    block = [*takewhile(lambda row: not _is_reading(row[1]), reversed(rows))][::-1]
+    return bool((block and OF_CHECKS.search(_text(block[-1][1]))) or _is_of_check(_title(block)))
 
 
 def _go_on(rows: Sequence[tuple[int, Cells]], place: int) -> bool:
@@ -1206,6 +1286,8 @@ def _titles_of(span: _Span, columns: Sequence[Cells], others: Block) -> Titles:
     following = span.next_block if _facts(span.next_block) else []
     apart = {line for line, _ in following}
     stated = stated_above(first, _beside(columns, [row for row in others if row[0] not in apart]))
+    if day := _day_of_check(_title(span.blocks[0])):
+        stated = stated._replace(metadata={**stated.metadata, "date": day}, unclear_day="")
     every = [*map(stated_above, above)]
     if stated.unclear_day or "serial" in stated.metadata:
         every = [
@@ -1278,6 +1360,36 @@ def _table(sheet: Sheet, span: _Span, source: str, decimal: str) -> Layout | Non
         ),
         places=dict(zip(names, letters, strict=True)) if sheet.name else {},
     )
+
+
+def _title(block: Block) -> str:
+    """The line of a title block that says what its table is: the last one, or above facts of the tool the first one."""
+    if not block:
+        return ""
+    first, last = (_line(block[k][1]) for k in (0, -1))
+    is_title = _is_of_check(first) or _CALLED_RUN.match(first)
+    is_entry = len([*filter(None, block[-1][1])]) > 1
+    return first if is_entry and is_title and not OF_CHECKS.search(last) else last
+
+
+def _is_of_check(line: str) -> bool:
+    """Whether a line begins as the title of a check, and is no entry of a title block, such as Verified by: AB."""
+    return bool(OF_CHECKS.match(line) and not _OF_ENTRY.search(line))
+
+
+def _day_of_check(title: str) -> str:
+    """The day behind the title of a check, in ISO form; empty without one.
+
+    >>> _day_of_check("Roll test 13.03.2026"), _day_of_check("Check due 13.03.2026")
+    ('2026-03-13', '')
+    """
+    words = re.sub(r"[(),;]", " ", title).split() if _is_of_check(title) else []
+    return next(filter(None, (day_of(" ".join(words[k:])) for k in range(1, len(words)))), "")
+
+
+def _line(row: Cells) -> str:
+    """The text of a row."""
+    return " ".join(map(as_text, row)).strip()
 
 
 def _with_warmth_of_lines(layout: Layout, lines: Sequence[tuple[int, Cells]]) -> Layout:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from typing import NamedTuple
 
@@ -394,6 +394,14 @@ def dated(
     """Metadata with the one day of all cells of a column of dates or times, where they have no date."""
     if "date" in metadata:
         return dict(metadata)
+    day = next((day for _, day in columns_of_a_day(columns)), "")
+    return {**metadata, "date": day} if day else dict(metadata)
+
+
+def columns_of_a_day(
+    columns: Iterable[tuple[str, Sequence[str] | Array]],
+) -> Iterator[tuple[str, str]]:
+    """The columns of dates or times all cells of which are of one day, and that day."""
     for name, cells in columns:
         if name in LABELS or isinstance(cells, np.ndarray):
             continue
@@ -405,8 +413,7 @@ def dated(
                 break
             day = each
         if day:
-            return {**metadata, "date": day}
-    return dict(metadata)
+            yield name, day
 
 
 _MEANT = {_word(word): key for key, words in _TITLE_WORDS.items() for word in words.split()}
