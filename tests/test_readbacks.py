@@ -128,7 +128,7 @@ def test_calibrations_by_readbacks_cover(jitter, follows, error, sd, settings):
         for k, v in enumerate(attitude(*true, turn)(tool.gravity, tool.field, tool.dip))
     ]
     if sd and not follows:
-        sd = {name: jitter / 3**0.5 for name in sd}
+        sd = dict.fromkeys(sd, jitter / 3**0.5)
     known = {"inclination": shown[0], "azimuth": shown[1], "toolface": turn}
     known |= {"field": tool.field, "dip": tool.dip, "settings": settings}
     run = mwdcal.readings(*raw, **known, sd={**stated(tool.noise), **sd})
