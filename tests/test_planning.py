@@ -23,8 +23,8 @@ from mwdcal.calibration.options import ASSUMED, settings_of
 from mwdcal.calibration.results import accuracy_at, readings_at
 from mwdcal.errors import FitError, InputError
 from mwdcal.files.documents import read
+from mwdcal.files.formats.table import Table, write
 from mwdcal.files.formats.table import read as read_table
-from mwdcal.files.formats.table import write
 from mwdcal.files.profiles import built_in, load_profile
 from mwdcal.geometry.vectors import reference_vectors
 from mwdcal.planning import planned
@@ -315,25 +315,39 @@ def test_planned_information_is_that_of_the_fit(common):
 STAND = Stand(degrees_per_second=2.0, settle_seconds=10.0, soak_minutes=60.0)
 
 
+def session(attitudes, temperatures, stand):
+    """Seconds of a session of stations (n, 3) at temperatures, °C."""
+    names = ("ref_inclination_deg", "ref_azimuth_deg", "ref_toolface_deg")
+    columns = dict(zip(names, np.transpose(np.asarray(attitudes, float)), strict=True))
+    columns |= {"temperature_c": np.asarray(temperatures, float)}
+    return session_seconds(Table(columns), stand)
+
+
 def test_seconds_of_a_session():
-    stations = np.array([[0.0, 0, 0], [90, 0, 0], [90, 350, 20]])
+    stations = [[0, 0, 0], [90, 0, 0], [90, 350, 20]]
     # 90° at 2°/s, then 20° (azimuth the short way: 10°), three readings after 10 s each, one soak
-    assert session_seconds(stations, np.zeros(3, int), STAND) == 45 + 10 + 30 + 3600
-    assert session_seconds(stations, np.array([0, 0, 1]), STAND) == 45 + 10 + 30 + 7200
-    usual = replace(
-        STAND, soak_minutes=None
-    )  # one temperature needs no oven; of two each is a soak of 90 min
-    assert session_seconds(stations, np.zeros(3, int), usual) == 45 + 10 + 30
-    assert session_seconds(stations, np.array([0, 0, 1]), usual) == 45 + 10 + 30 + 2 * 5400
+    assert session(stations, [20, 20, 20], STAND) == 45 + 10 + 30 + 3600
+    assert session(stations, [20, 20, 60], STAND) == 45 + 10 + 30 + 7200
+
+
+@pytest.mark.parametrize(
+    ("temperatures", "soaks"),
+    [([20, 20, 21], 0), ([np.nan] * 3, 0), ([120] * 3, 1), ([-20] * 3, 1), ([20, 60, 20], 3)],
+)
+def test_a_session_that_needs_an_oven_soaks_for_90_minutes(temperatures, soaks):
+    """The stand is in a room of 20 °C: at 120 °C or -20 °C alone the tool takes as long to get there."""
+    usual = replace(STAND, soak_minutes=None)
+    stations = [[0, 0, 0], [90, 0, 0], [90, 350, 20]]
+    assert session(stations, temperatures, usual) == 45 + 10 + 30 + soaks * 5400
 
 
 def test_an_axis_with_ends_goes_back_the_long_way():
-    stations = np.array([[90.0, 350, 0], [90, 10, 0]])
+    stations, warmth = [[90, 350, 0], [90, 10, 0]], [20, 20]
     ended = replace(STAND, reach={"azimuth": (0.0, 360.0)})
-    assert session_seconds(stations, np.zeros(2, int), STAND) == 10 + 20 / 2 + 10 + 3600
-    assert session_seconds(stations, np.zeros(2, int), ended) == 10 + 340 / 2 + 10 + 3600
+    assert session(stations, warmth, STAND) == 10 + 20 / 2 + 10 + 3600
+    assert session(stations, warmth, ended) == 10 + 340 / 2 + 10 + 3600
     across = replace(STAND, reach={"azimuth": (-180.0, 180.0)})
-    assert session_seconds(stations, np.zeros(2, int), across) == 10 + 20 / 2 + 10 + 3600
+    assert session(stations, warmth, across) == 10 + 20 / 2 + 10 + 3600
 
 
 def test_what_a_stand_reaches():

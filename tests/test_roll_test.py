@@ -44,12 +44,14 @@ def rolls(rng, count, spread, noise, toolface=TWELVE, stated=None):
 def test_a_perfect_tool_passes_where_noise_alone_spreads_the_raw_values():
     """0.5 mg: 0.029° of one inclination. The raw spread of twelve is 3.258 σ; the limit 0.1°."""
     value, curve = rolls(np.random.default_rng(1), 1000, 0.0, 0.029)
-    raw, found = np.ptp(value, axis=-1), extent(curve).range
+    raw, turn = np.ptp(value, axis=-1), extent(curve)
+    found = turn.range
     assert raw.mean() == pytest.approx(RANGE_OF_12 * 0.029, rel=0.02)
     assert (raw > 0.1).mean() > 0.3
     assert (found > 0.1).mean() < 0.01
     assert found.mean() == pytest.approx(0.029, abs=0.006)
     assert found.std() == pytest.approx(0.025, abs=0.004)
+    assert (found < 1.96 * turn.range_sd).mean() == pytest.approx(0.86, abs=0.035)
 
 
 @pytest.mark.parametrize(

@@ -312,8 +312,8 @@ the limit may fail. That is its price, and the FAIL says so where the value itse
 0.5 mg one σ of the spread of inclination is a quarter of its limit: average longer before you guard.
 
 The predicted risk does not know how many tools are good. Where all are, no PASS is wrong and more FAILs are than
-predicted. And a spread far below its limit is known better than its 1σ says: it cannot be negative, and its 1σ holds
-the size of the bias taken off.
+predicted. And a spread that is nearly zero comes out too large, as it cannot be negative, with or without readbacks: of
+95 % intervals of a spread of zero 86 % hold it, and the others lie above it.
 
 ## Each limit, knocked tools, simple rule
 

@@ -424,8 +424,8 @@ def soaks(temperature: Array) -> Ints:
 def direction_numbers(inclination: Array, azimuth: Array) -> Ints:
     """Number (..., n) of the reference direction of each station of a run; a blank angle equals a blank one.
 
-    Definition: both angles of the stations of a direction, in order of size, follow each other by at most
-    `ONE_SETTING`, as an encoder shows one setting, and lie within that of their middle. Where
+    Definition: both angles of the stations of a direction lie within `ONE_SETTING` of their middle, as an encoder
+    shows one setting, so that in order of size they follow each other by less than twice that. Where
     they go further, as on a ramp, only stations of equal angles are of one direction.
     """
     inclination, azimuth = np.broadcast_arrays(inclination, azimuth)
@@ -434,7 +434,7 @@ def direction_numbers(inclination: Array, azimuth: Array) -> Ints:
     known = np.nan_to_num(known, nan=_BLANK)
     angles = np.nan_to_num(np.stack([inclination, azimuth]).reshape(2, -1))
     number = run = np.arange(known.shape[-1]) // count
-    for most in (ONE_SETTING, EQUAL):
+    for most in (2 * ONE_SETTING - EQUAL, EQUAL):
         last = -1
         while last != (last := number.max(initial=0)):
             for each in known:

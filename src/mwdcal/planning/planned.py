@@ -57,6 +57,7 @@ from mwdcal.planning.plans import (
     joined,
     load_plan,
     soak_numbers,
+    soak_temperatures,
     taken,
     without_estimates,
 )
@@ -68,6 +69,8 @@ AT_ENDS_WITHIN = 1e-6
 
 USUAL_SOAK = 90.0
 """Minutes until a tool has the temperature of its next soak."""
+WITHOUT_OVEN = (10.0, 35.0)
+"""Coldest and hottest one temperature of a session that needs no oven, °C."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ class Stand:
 
     `degrees_per_second` of an axis, `settle_seconds` between the end of a move and the reading,
     `soak_minutes` until the tool has the temperature of the next soak; None: `USUAL_SOAK`, and no soak at all where
-    the session has one temperature. `reach`: the least and the largest
+    the session needs no oven. `reach`: the least and the largest
     setting by angle, degrees; azimuth and toolface without one turn round and round.
     """
 
@@ -141,20 +144,20 @@ def move_seconds(attitude: Array, stand: Stand) -> Array:
     return np.asarray(difference.max(-1) / stand.degrees_per_second + stand.settle_seconds)
 
 
-def session_seconds(attitude: Array, soak: Ints, stand: Stand) -> float:
-    """Duration of a session, from its first soak to its last reading, of stations in order.
-
-    `soak` (n,) numbers the temperatures; each change of it is a soak, and so is the first.
-    """
-    seconds = move_seconds(attitude, stand)
-    moves = float(seconds[np.arange(len(soak) - 1), np.arange(1, len(soak))].sum())
-    return stand.settle_seconds + moves + soak_seconds(soak, stand)
+def session_seconds(plan: Table, stand: Stand) -> float:
+    """Duration of a session, from its first soak to its last reading, of stations in order."""
+    seconds = move_seconds(attitudes(plan), stand)
+    moves = float(seconds[np.arange(plan.count - 1), np.arange(1, plan.count)].sum())
+    return stand.settle_seconds + moves + soak_seconds(plan, stand)
 
 
-def soak_seconds(soak: Ints, stand: Stand) -> float:
-    """Duration of all soaks of a session."""
-    changes = int(np.count_nonzero(np.diff(soak)))
-    usual = USUAL_SOAK if changes else 0.0
+def soak_seconds(plan: Table, stand: Stand) -> float:
+    """Duration of all soaks of a session: one for each change of temperature, and the first."""
+    warmth = soak_temperatures(plan)
+    least, most = WITHOUT_OVEN
+    oven = len(warmth) > 1 or bool(np.any((warmth < least) | (warmth > most)))
+    usual = USUAL_SOAK if oven else 0.0
+    changes = int(np.count_nonzero(np.diff(soak_numbers(plan))))
     return 60.0 * (usual if stand.soak_minutes is None else stand.soak_minutes) * (1 + changes)
 
 
@@ -267,15 +270,14 @@ class Planned:
     ) -> Planned:  # fmt: skip
         """A plan with the calibration that it will give; `whole` also has the stations measured already."""
         calibration, result = carried_out(whole, profile, options)
-        soak = soak_numbers(plan)
         anew = with_fields(profile, stand=with_fields(profile.stand, settings=PRACTICES[1]))
         return cls(
             plan,
             calibration,
             efficiency,
-            seconds=session_seconds(attitudes(plan), soak, stand),
+            seconds=session_seconds(plan, stand),
             freedom=freedom_of(result)[0],
-            soaking=soak_seconds(soak, stand),
+            soaking=soak_seconds(plan, stand),
             detections=detections(result),
             set_anew=partial(expected, whole, anew, options),
             stand=stand,

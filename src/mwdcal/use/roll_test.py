@@ -661,13 +661,13 @@ class ReferenceErrors:
 class _Rolled:
     """Values (k,) of a rolled set to judge, their curve, and the uncertainty of the references.
 
-    `noisy`: share of the noise in the variance of a value, what all values share apart.
+    `known`: degrees of freedom of the standard deviations of the values, what all values share apart.
     """
 
     roll_set: RollSet
     part: Array
     curve: Curve
-    noisy: float
+    known: float
     reference: ReferenceErrors
 
 
@@ -922,13 +922,12 @@ class RollTest:
         if not sets:
             return [], ()
         rolled = [self._rolled(name, s, error) for s in sets]
-        stated, doubted = self.noise_freedom(name), False
+        doubted = False
         if name in DIRECTION and is_assumed(self.readings):
-            doubted = any(bool(each.curve.rough(stated)) for each in rolled)
+            doubted = any(bool(each.curve.rough(each.known)) for each in rolled)
         if doubted:  # that the direction was set once was an assumption
             rolled = [self._rolled(name, s, error, doubted) for s in sets]
-        known = stated / max(each.noisy for each in rolled) ** 2
-        noise = scatter([each.curve for each in rolled], known)
+        noise = scatter([each.curve for each in rolled], min(each.known for each in rolled))
         remarks = {"little-scatter": bool(noise.calm), "settings-doubted": doubted}
         statistics = [self._curve_of(name, each, noise, error) for each in rolled]
         return statistics, tuple(remark for remark, holds in remarks.items() if holds)
@@ -956,8 +955,11 @@ class RollTest:
                 f"{self.readings.source}: the uncertainties of {roll_set.label} are too far apart to judge "
                 f"its {name}. Check the columns sd_: they are in the unit of their column."
             )
-        noisy = float(np.mean(noise**2) / np.mean(sd**2 + among**2))
-        return _Rolled(roll_set, part, curve, noisy, reference)
+        whole, apart = np.mean(sd**2 + among**2), self._readback(name, roll_set, error).var(ddof=1)
+        noisy, read = (float(x / whole) ** 2 for x in (np.mean(noise**2), apart))
+        unknown = noisy / self.noise_freedom(name) + read / (len(index) - 1)
+        known = 1 / unknown if unknown else UNLIMITED
+        return _Rolled(roll_set, part, curve, known, reference)
 
     def _curve_of(self, name: str, rolled: _Rolled, noise: NoiseScale, error: bool) -> Statistic:
         """Noise-free spread, or largest error, of a rolled set."""

@@ -64,7 +64,7 @@ from mwdcal.app.messages import print_result
     "--soak",
     type=float,
     metavar="MIN",
-    help="To reach a temperature; 0 without an oven. Default: 90, but 0 where the plan has one temperature.",
+    help="To reach a temperature; 0 without an oven. Default: 90, but 0 at one temperature from 10 to 35 °C.",
 )
 @options.tool(
     help="Tool profile: a name that mwdcal list profiles shows, or a TOML file. Or a calibration (JSON): its profile, "
