@@ -179,8 +179,8 @@ VERDICT_FINDINGS = {
     "misalignment of x and y (four at right angles fit a mean and the first harmonic alone). The value may be "
     "too small by it: add toolfaces between them.",
     "little-scatter": "{title}: the readings scatter less about the curves than the {noise} noise explains (chance "
-    "below {chance:g}). {stand}This noise is too large, or the tool moved: during the run of the calibration, or as its "
-    "readbacks say, which both count as noise. Else readings are repeated, or stations apart in the table share one "
+    "below {chance:g}). {stand}This noise is too large, or the tool moved, during the run of the calibration or as "
+    "readbacks say: both count as noise. Else readings are repeated, or stations apart in the table share one "
     "setting of the stand (then give them one group: it is counted once). The 1σ comes from the {noise} noise.",
     "settings-doubted": "{title}: the readings scatter about the curves as if the stand was set at every station. Its "
     "error is counted both ways. State [stand] settings in the profile.",
