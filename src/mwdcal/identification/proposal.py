@@ -550,6 +550,7 @@ def _proposal(
     table, form, columns, by_value, ignored = named_columns(table, form, where, answers)
     if filled := _with_angles_filled(name, where, (table, whole), columns, form, stated, answers):
         return filled
+    _check_serials(where, {*columns, *stated}, table.source)
     _check_choices(where, {*columns, *table.metadata, *answers}, table.source)
     check_cells(table, columns)
     blank = _blank_references(table, columns)
@@ -592,6 +593,17 @@ def _level(readings: Readings) -> tuple[float, float] | None:
     return float(np.degrees(known.min())), float(np.degrees(known.max()))
 
 
+def _check_serials(where: Layout | None, known: Collection[str], source: str) -> None:
+    """Ask which serial is that of the tool where sheets of a file state different ones."""
+    serials = where.titles.choices.get("serial", ()) if where and "serial" not in known else ()
+    if serials:
+        every = [str(serial) for serial in serials]
+        raise QuestionError(
+            f"{source}: its sheets state the serials {' and '.join(map(shown, every))}. Which one is that of the tool?",
+            [Answer(serial, (("serial", serial),)) for serial in every],
+        )
+
+
 def _check_choices(where: Layout | None, known: Collection[str], source: str) -> None:
     """Ask about references of which lines beside the table state different values, where nothing else states them."""
     choices = where.titles.choices if where else {}
@@ -606,7 +618,9 @@ def _check_choices(where: Layout | None, known: Collection[str], source: str) ->
             ],
         )
         for column, values in choices.items()
-        if column not in known and (magnetic or column == REFERENCES["gravity"].column)
+        if column in _OF_THE_PLACE
+        and column not in known
+        and (magnetic or column == REFERENCES["gravity"].column)
     ]
     if questions:
         raise QuestionsError(source, questions)

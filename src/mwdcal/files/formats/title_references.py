@@ -248,7 +248,7 @@ _ANOTHER_UNIT = re.compile(r"\s*[^\W\d_]{1,3}(?![^\W\d_])(?!\W*\d)")
 _ANOTHER = re.compile(
     rf"[\s;,/|)]*(?:[^\W\d_]{{3,}}[,;/]\s*(?={_WRITTEN_NUMBER}\W{{0,2}}\s[^\W\d_]{{3,}}))?(?:(?:and|or|und|oder|bzw|"
     rf"og|eller|y|o|e|ou|et|и|или|resp)(?![^\W\d_])\s*)?"
-    rf"(?P<number>{_WRITTEN_NUMBER})(?![./-]?\d)\s*(?:{_WRITTEN_UNIT}|(?!°|[^\W\d_]))"
+    rf"(?P<number>{_WRITTEN_NUMBER})(?![./-]?\d)\s*(?P<unit>{_WRITTEN_UNIT}|(?!°|[^\W\d_]))"
 )
 """A second value right behind one, or behind a name as the first is: 70.5 / 66.0, 70.5 Aberdeen, 58.1 Houston."""
 
@@ -958,7 +958,8 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     units = units[:1] if letter and not stated and quantity.low > EARTH_FIELD[0] - 1 else units
     inside = [*_inside(quantity, numbers, units)]
     other = _ANOTHER.match(match.string, match.end("unit" if match["unit"] else "number"))
-    others = _inside(quantity, _numbers(other["number"]), units) if other else ()
+    same = other and _stated_unit(quantity, other["unit"]) in ("", *quantity.units)
+    others = _inside(quantity, _numbers(other["number"]), units) if other and same else ()
     if len(inside) == 1:
         yield inside[0]
         yield from (v for v in others if abs(v - inside[0]) < abs(inside[0]) / 2)
