@@ -550,7 +550,8 @@ _LOW_SIDE = (
 )
 _FROM_LOW = re.compile(
     rf"(?:{_ZERO}|(?<![^\W\d_])(?:from|von|ab|desde|a partir d[eo]|fra|från|depuis|vanaf|dal?|от|od)(?![^\W\d_])|从|自)"
-    rf"[^\d,;.]{{0,30}}?{_LOW_SIDE}|{_LOW_SIDE}\s*[)\]]?\s*(?:[=:：]|is|at|bei|ist|ved|en|is op|为)\s*{_ZERO}",
+    rf"(?:[^\d,;.]|,(?=\s*(?:wenn|когда|если|коли|da|gdy)\b)){{0,30}}?{_LOW_SIDE}|"
+    rf"{_LOW_SIDE}\s*[)\]]?\s*(?:[=:：]|is|at|bei|ist|ved|en|is op|为)\s*{_ZERO}",
     re.IGNORECASE,
 )
 """Words of toolfaces that count from the low side, or that are zero where the mark of the tool is down."""

@@ -63,6 +63,7 @@ _OF_PLACES = (
         r"inklinacja( pola)?|inclinazione (magn\w*|del campo)|plongement|pendage|magn\w* inclinatie|"
         r"(feld|feld-|magn\w* ?)?inklination|(feld-?|magn\w* )neigung|"
         r"(felt|magn\w* ?)?inklinasjon|(felt|magn\w* ?)helning|mergulho( magn\w*)?|inclinaca?o (magn?\w*|do campo)|"
+        r"inclinarea? (magn\w*|campului)|(goc )?(do )?tu khuynh|"
         r"inclinacion (magn\w*|del campo)|echado|buzamiento|inclinaison( magn\w*| du champ)?|"
         r"(магн\w* |угол )?накл(онени[ея])?\.?( мпз)?|(地)?磁倾角",
         "i",
@@ -91,7 +92,7 @@ _WRITTEN_UNIT = (
     r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss|s)?\b|gauss|gs\b|oe\b|a\s?/\s?m\b|gals?\b|gons?\b|"
     r"nano ?teslas?\b|micro ?teslas?\b|нтл|мктл|мтл|м?гал|гс\b|э\b|м/с²?|м/с2|"
     r"m\s?/\s?s\s?(?:²|\^?2)?|[gг]\b(?!\s*[=:(\[]?\s*(?:[+-]?\d|m\s?/))|°|deg\w*|gra[ud]\w*|rad\b|град\w*|"
-    r"fok|derece|stopni|度"
+    r"fok|derece|stopni|度|도\b"
 )
 _WRITTEN_NUMBER = (
     r"[+\-−]?\d{1,3}(?:[ '’.,\u00a0\u202f]\d{3})+(?:[.,]\d+)?(?!\d)|[+\-−]?\d+(?:[.,]\d+)?"
@@ -339,7 +340,7 @@ _ALWAYS_WRITTEN = ("gon", "A/m", "mT", "gauss", "mG")
 """Units in which no bare number is read: 0.5 may be any factor."""
 _SPELT = {
     "нтл": "nT", "мктл": "µT", "мтл": "mT", "м/с": "m/s²", "м/с²": "m/s²", "м/с2": "m/s²", "m/s": "m/s²", "г": "g",
-    "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
+    "град": "°", "度": "°", "도": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
     "γ": "nT", "gammas": "nT", "kγ": "µT", "kgamma": "µT",
     "nanotesla": "nT", "nanoteslas": "nT", "microtesla": "µT", "microteslas": "µT",
     "a/m": "A/m", "oe": "gauss", "э": "gauss", "гс": "gauss", "мгс": "mG",
