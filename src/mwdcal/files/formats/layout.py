@@ -713,7 +713,7 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
 
 
 def _is_same_serial(one: str, other: str) -> bool:
-    """Whether two serials are one, but for signs, capitals and what stands before or behind it."""
+    """Whether two serials are one, but for signs, capitals and text around it."""
     bare = [re.sub(r"[\W_]", "", each.casefold()) for each in (one, other)]
     return bare[0] in bare[1] or bare[1] in bare[0]
 

@@ -440,7 +440,7 @@ def day_of(text: str, day_first: bool = False) -> str:
 
 
 def _day_in_words(text: str) -> str:
-    """A day whose month is a word, in whatever language, or stands before the word for it; in ISO form.
+    """A day whose month is a word of any language, or a number with the word for a month; in ISO form.
 
     >>> [_day_in_words(t) for t in ("21 de mayo de 2024", "August 22, 2024", "2024년 2월 21일", "14. Mai", "1 st 2024")]
     ['2024-05-21', '2024-08-22', '2024-02-21', '', '']
