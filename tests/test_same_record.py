@@ -109,7 +109,8 @@ def test_own_axis_terms_are_chosen_alike(tmp_path, name):
 def test_a_previous_calibration_is_the_same_prior(tmp_path):
     previous = calibrated(tmp_path, servo_run(1), "--parameters", 9)
     run = write_csv(tmp_path / "later.csv", servo_run(2))
-    options = {"prior": documents.read(previous)}
+    prior, digest = documents.load(previous)
+    options = {"prior": prior, "prior_sha256": digest}
     record = check(tmp_path, run, "servo", ("--prior", previous), options)
     assert record.options.parameters == 9
     assert record.prior_sha256 == sha256(previous)

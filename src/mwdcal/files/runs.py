@@ -417,8 +417,16 @@ def station_table(table: Table, profile: Profile) -> Table:
         return table
     if sets.numbered or not (sources or sets.labelled):
         return replace(table, remarks=(*table.remarks, sets.advice()))
+    _check_cells(renamed(table, profile), profile)
     scales = {kind: getattr(profile, kind).scale for kind in CHANNELS}
     return replace(means(table, sources, sets), remarks=(*table.remarks, sets.sentence(scales)))
+
+
+def _check_cells(table: Table, profile: Profile) -> None:
+    """Refuse the first cell that a run may not have, by its row; the rows of a tool that follow each other are a run."""
+    tools = np.array(labels(table, "serial") or [""] * table.count)
+    starts = np.r_[0, 1 + np.flatnonzero(tools[1:] != tools[:-1]), table.count]
+    refuse(table, faults(columns_of(table), starts, profile))
 
 
 def _check_names(table: Table, sources: Mapping[str, ColumnSource]) -> None:

@@ -439,7 +439,7 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
             *_findings(test, skipped),
             *_contradicted(test, limits),
             *_differing(test),
-            *_remarks(judged, STATE_STAND * (STAND_ANGLES_EXACT in calibration.assumed_exact)),
+            *_remarks(test, judged, STATE_STAND * (STAND_ANGLES_EXACT in calibration.assumed_exact)),
             *chain(*(j.findings for j in judged)),
         ],
         station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
@@ -463,11 +463,12 @@ class _Judged:
     errors: Array | None = None
 
 
-def _remarks(judged: Sequence[_Judged], stand: str) -> Iterator[Finding]:
+def _remarks(test: RollTest, judged: Sequence[_Judged], stand: str) -> Iterator[Finding]:
     """Findings that several limits share, each once; `stand`: of a calibration that took its angles as exact."""
     for name in dict.fromkeys(chain(*(each.remarks for each in judged))):
         rows = [each.row for each in judged if name in each.remarks]
-        noise = dict.fromkeys("stated" if row.freedom is None else "estimated" for row in rows)
+        freedom = (test.noise_freedom(row.name.rpartition(" of ")[2]) for row in rows)
+        noise = dict.fromkeys("estimated" if np.isfinite(each) else "stated" for each in freedom)
         title, whose = ", ".join(row.name for row in rows), " or ".join(noise)
         yield _finding(name, title=title, noise=whose, chance=DEPARTURE_CHANCE, stand=stand)
 
