@@ -48,6 +48,18 @@ def read(run, tool=None):
     )
 
 
+@pytest.mark.parametrize(
+    ("off", "count"),
+    [([0.045, -0.05, 0.05, 0.01, -0.01], COUNT), ([-0.08, -0.03, 0.03, 0.08, 0.04], COUNT * READINGS)],
+)
+def test_readbacks_of_one_setting_lie_about_their_middle(off, count):
+    """Two of them may differ by 0.1°; where a row after the other goes further, each is a station."""
+    run, _ = repeated()
+    for name in ANGLES:
+        run[name] = np.round(run[name] + np.tile(off, COUNT), 6)
+    assert read(run).count == count
+
+
 def test_rows_of_one_label_and_setting_are_one_station_at_their_means(tmp_path):
     run, _ = repeated()
     path, tool, cal = tmp_path / "a.csv", tmp_path / "t.toml", tmp_path / "c.json"

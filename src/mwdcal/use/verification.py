@@ -330,7 +330,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     `degrees_of_freedom`: of the triad of the calibration with the fewest. None: a document of an earlier version.
     `risk`: probability that the verdict is wrong, all sets and limits together: that a true value is beyond
     its limit in a pass, that none is in a fail. None: a limit was not or cannot be judged, or readings are not smooth.
-    `not_judged`: names of limits for which the run lacks something; absent in documents of earlier versions.
+    `not_judged`: names of limits without a row, as the run lacks something; absent in documents of earlier versions.
     `settings`: how often the stand's direction was set, "per-direction", "per-station", or "assumed" to be once
     per direction; empty where nobody stated it and nothing rests on it.
     """
