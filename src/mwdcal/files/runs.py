@@ -558,7 +558,11 @@ def _with_angles(columns: dict[str, Column]) -> dict[str, Column]:
 def _with_stated_references(table: Table) -> Table:
     """The table with the references that its metadata state for all stations, where it has no column of them."""
     columns = dict(table.columns)
-    blank = [each.column for each in REFERENCES.values() if each.column in columns and is_blank(table, each.column)]
+    blank = [
+        each.column
+        for each in REFERENCES.values()
+        if each.column in columns and is_blank(table, each.column)
+    ]
     stated = stated_references(table.metadata, columns.keys() - blank, table.source)
     columns |= {column: np.full(table.count, value) for column, value in stated.items()}
     return replace(table, columns=columns)

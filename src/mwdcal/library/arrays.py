@@ -251,7 +251,7 @@ def _known(references: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, A
 def _as_stated(
     known: dict[str, Array], metadata: Mapping[str, object], shape: tuple[int, ...]
 ) -> dict[str, Array]:
-    """References (..., n) as the metadata of a file have them: magnetic azimuths, and what is stated for all stations."""
+    """References (..., n) as of a file with these metadata: magnetic azimuths, and values for all stations."""
     once = stated_references(metadata, [REFERENCES[name].column for name in known], _NAME)
     names = {each.column: name for name, each in REFERENCES.items()}
     values = {names[c] + DEGREES_SUFFIX * is_angle(c): value for c, value in once.items()}

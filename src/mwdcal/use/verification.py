@@ -439,7 +439,9 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
             *_findings(test, skipped),
             *_contradicted(test, limits),
             *_differing(test),
-            *_remarks(test, judged, STATE_STAND * (STAND_ANGLES_EXACT in calibration.assumed_exact)),
+            *_remarks(
+                test, judged, STATE_STAND * (STAND_ANGLES_EXACT in calibration.assumed_exact)
+            ),
             *chain(*(j.findings for j in judged)),
         ],
         station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
