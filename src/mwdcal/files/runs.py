@@ -423,7 +423,7 @@ def station_table(table: Table, profile: Profile) -> Table:
 
 
 def _check_cells(table: Table, profile: Profile) -> None:
-    """Refuse the first cell that a run may not have, by its row; the rows of a tool that follow each other are a run."""
+    """Refuse the first cell that a run may not have, by its row; rows of one tool that follow each other are a run."""
     tools = np.array(labels(table, "serial") or [""] * table.count)
     starts = np.r_[0, 1 + np.flatnonzero(tools[1:] != tools[:-1]), table.count]
     refuse(table, faults(columns_of(table), starts, profile))
