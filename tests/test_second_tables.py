@@ -324,3 +324,20 @@ def test_a_table_below_a_roll_test_is_one_too_unless_it_is_called_a_run(
     lines = [*A, "Roll test 45°", NAMES, *FIRST, "", title, NAMES, *SECOND]
     path.write_text("\n".join(lines) + "\n")
     assert [t.kind for t in tables.every_table(path)] == ["roll test", kind]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "xlsx"])
+def test_names_repeated_below_a_roll_test_are_not_joined_to_it_in_silence(
+    tmp_path: Path, suffix: str
+) -> None:
+    """Nothing calls the second table a run, nor are its rows numbered on: somebody must say what it is."""
+    rows = [["Roll test"], *FACTS, TITLES, *ROLLS, [], TITLES, *RUN]
+    path = tmp_path / f"two.{suffix}"
+    if suffix == "xlsx":
+        written(path, rows)
+    else:
+        path.write_text("\n".join(",".join(map(str, row)) for row in rows) + "\n")
+    asked = mwdcal("profile", path, "-o", tmp_path / "t.toml")
+    assert asked.code != 0
+    line = len(FACTS) + len(ROLLS) + 4
+    assert str(line) in asked.err

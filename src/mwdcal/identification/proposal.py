@@ -577,8 +577,10 @@ def _proposal(
     if sets:
         scales = {kind: triad.scale for kind, triad in triads.items()}
         remarks.append(sets.advice() if sets.numbered else sets.sentence(scales))
+    if not sets or sets.labelled:  # a run file's rows without labels are stations each
+        profile = _without_the_usual(profile)
     return Proposal(
-        _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
+        profile, wirings, readings.count, readings.unused, tuple(remarks), by_value,
         readings.metadata, readings.run_sha256, where, open_axes, ignored, source=table.source,
         all_fit=_all_fit(readings, wirings), level=_level(readings), said=said,
         others=tuple(n for n in table.columns if n not in {*OURS, *ignored, *(c.name for c in columns.values())}),

@@ -330,7 +330,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     `degrees_of_freedom`: of the triad of the calibration with the fewest. None: a document of an earlier version.
     `risk`: probability that the verdict is wrong, all sets and limits together: that a true value is beyond
     its limit in a pass, that none is in a fail. None: a limit was not or cannot be judged, or readings are not smooth.
-    `not_judged`: names of limits for which the run lacks something; absent in documents of earlier versions.
+    `not_judged`: names of limits without a row, as the run lacks something; absent in documents of earlier versions.
     `settings`: how often the stand's direction was set, "per-direction", "per-station", or "assumed" to be once
     per direction; empty where nobody stated it and nothing rests on it.
     """
@@ -439,7 +439,9 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
             *_findings(test, skipped),
             *_contradicted(test, limits),
             *_differing(test),
-            *_remarks(judged, STATE_STAND * (STAND_ANGLES_EXACT in calibration.assumed_exact)),
+            *_remarks(
+                test, judged, STATE_STAND * (STAND_ANGLES_EXACT in calibration.assumed_exact)
+            ),
             *chain(*(j.findings for j in judged)),
         ],
         station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
@@ -463,11 +465,12 @@ class _Judged:
     errors: Array | None = None
 
 
-def _remarks(judged: Sequence[_Judged], stand: str) -> Iterator[Finding]:
+def _remarks(test: RollTest, judged: Sequence[_Judged], stand: str) -> Iterator[Finding]:
     """Findings that several limits share, each once; `stand`: of a calibration that took its angles as exact."""
     for name in dict.fromkeys(chain(*(each.remarks for each in judged))):
         rows = [each.row for each in judged if name in each.remarks]
-        noise = dict.fromkeys("stated" if row.freedom is None else "estimated" for row in rows)
+        freedom = (test.noise_freedom(row.name.rpartition(" of ")[2]) for row in rows)
+        noise = dict.fromkeys("estimated" if np.isfinite(each) else "stated" for each in freedom)
         title, whose = ", ".join(row.name for row in rows), " or ".join(noise)
         yield _finding(name, title=title, noise=whose, chance=DEPARTURE_CHANCE, stand=stand)
 

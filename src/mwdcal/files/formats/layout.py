@@ -1172,9 +1172,9 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     between = [
         " ".join(map(as_text, row)) for _, row in rows[heads[-1] : place] if not _is_reading(row)
     ]
-    if (_is_below_check(rows[: heads[-1]]) and between[1:]) or any(
-        ADJUSTED.search(text) or OF_CHECKS.search(text) for text in between[1:]
-    ):
+    if _is_below_check(rows[: heads[-1]]) and (between[1:] or not _go_on(rows, place)):
+        return True
+    if any(ADJUSTED.search(text) or OF_CHECKS.search(text) for text in between[1:]):
         return True
     first = _triads_in(" ".join(_text(row) for _, row in rows[max(0, heads[-1] - 1) : heads[-1]]))
     if first and _triads_in(" ".join(between[1:])) - first:
