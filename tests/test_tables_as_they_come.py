@@ -204,7 +204,8 @@ def test_a_day_with_its_month_in_words_of_other_languages(cells, day):
         (["Ferramenta", "MWD-BR 0092"], "MWD-BR 0092"), (["Verktøy nr. BG 114"], "BG 114"),
         (["Calibrare senzori, seria RO-58, Ploiești"], "RO-58"), (["Số máy (S/N)", "VT-0065"], "VT-0065"),
         (["Gyári szám:", "HU-0238"], "HU-0238"), (["일련번호", "KR-D 014"], "KR-D 014"),
-        (["Заводський номер", "4471"], "4471"), (["Seria 2"], None), (["Tool May 2024"], None),
+        (["Заводський номер", "4471"], "4471"), (["Seria 2"], None), (["Stand (S/N)", "44"], None),
+        (["Tool May 2024"], None),
     ],
 )  # fmt: skip
 def test_a_serial_behind_words_of_other_languages(cells, serial):

@@ -399,9 +399,9 @@ def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
     if _MEANT.get(_word(first)) == "date" and day_of(behind, True):
         return "date", behind
     word = _word(head.lstrip("#"))
-    inside = (_word(text) for text in re.findall(r"[(\[](.*?)[)\]]", head))
+    inside = [_MEANT.get(_word(text)) for text in re.findall(r"[(\[](.*?)[)\]]", head)]
     key = _MEANT.get(word, "serial" if _NUMBER_OF_TOOL.fullmatch(word) else "")
-    key = key or next((_MEANT[text] for text in inside if text in _MEANT), "")
+    key = key or ("serial" if "serial" in inside and not _OF_EQUIPMENT.search(head) else "")
     if not key:
         return "", ""
     return key, "".join(tail).strip(' "') or next(
