@@ -1738,6 +1738,24 @@ def lines_not_taken(proposal: Proposal) -> list[Finding]:
     )
 
 
+def read_as_thousands(proposal: Proposal) -> list[Finding]:
+    """A finding on each reference whose decimal sign in the table is read as one of thousands: 50.612 nT."""
+    sign = "," if proposal.profile.form.decimal == "," else "."
+    number = re.compile(rf"(?<![\d.,])(\d{{1,3}})\{sign}(\d{{3}})(?![\d.,])")
+    lines = proposal.where.above if proposal.where else ()
+    return [
+        Finding(
+            id="reference-rescaled",
+            text=f"{column}: {match[0]} of the line {shown(line)} is taken as {value:.8g} {RANGES[column].unit}. "
+            "Correct the number or its unit in the table.",
+        )
+        for column, value in stated_references(proposal).items()
+        for line in lines
+        for match in number.finditer(line)
+        if references_in([[line.replace(match[0], match[1] + match[2])]]).get(column) == value
+    ]
+
+
 def answers_by_readings(proposal: Proposal) -> list[Finding]:
     """A finding on what the names of a table leave open and the readings answer."""
     return [
@@ -1833,6 +1851,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         + axes_open(proposal)
         + left_handed({kind: each.axes for kind, each in proposal.wirings.items()})
         + lines_not_taken(proposal)
+        + read_as_thousands(proposal)
         + marked
     )
     if proposal.profile.columns is not msgspec.UNSET and RAW[3] not in proposal.profile.columns:

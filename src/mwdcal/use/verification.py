@@ -279,7 +279,7 @@ CANNOT_BE_PASSED = "cannot be passed: "
 class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
     """One limit: the noise-free value, its standard uncertainty, and the decision.
 
-    `value` is that of the worst set or station; of several, less what choosing the largest adds.
+    `value` is that of the worst set or station; of several the largest, less what noise adds to it.
     `degrees_of_freedom` of `uncertainty`: None, unlimited, as the noise is declared; absent in documents of
     earlier versions. `probability_within`: that the true value is within the limit.
 
@@ -640,17 +640,25 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
 
 
 def _check_rolled(test: RollTest) -> None:
-    """Refuse stations of a run that names no direction, where they are of several."""
-    readings = test.readings
-    named = (readings.groups >= 0).any() or np.isfinite(readings.reference("inclination")).any()
-    most = np.sin(NO_ERROR_OF_A_TOOL["inclination"])
-    if named or not any(test.off_plane(s.index) > most for s in test.sets):
+    """Refuse a run that names no direction, where its stations are of several or no set of them is rolled."""
+    readings, everything = test.readings, np.arange(test.readings.count)
+    if (readings.groups >= 0).any() or np.isfinite(readings.reference("inclination")).any():
         return
-    angles = np.degrees(test.value("inclination"))
+    gaps = [test.loose(each.index) for each in test.sets]
+    if test.off_plane(everything) > np.sin(NO_ERROR_OF_A_TOOL["inclination"]):
+        angles = np.degrees(test.value("inclination"))
+        why = (
+            f"its stations, at inclinations from {angles.min():.1f}° to {angles.max():.1f}°, are of several "
+            "directions. Name another table, or give ref_inclination_deg and ref_azimuth_deg, or a group for each "
+            "direction"
+        )
+    elif gaps and all(gaps):
+        why = f"{gaps[0]}, or name another table"
+    else:
+        return
     raise InputError(
-        f"{readings.name} is no roll test, in which the tool is rolled about an axis that stands still: its stations, "
-        f"at inclinations from {angles.min():.1f}° to {angles.max():.1f}°, are of several directions. Name another "
-        "table, or give ref_inclination_deg and ref_azimuth_deg, or a group for each direction."
+        f"{readings.name} is no roll test, in which the tool is rolled all round about an axis that stands still: "
+        f"{why}."
     )
 
 
