@@ -149,9 +149,7 @@ def test_a_drift_that_no_finding_names_is_on_the_screen_too():
     steady = expected(load_plan("twelve-state"), load_profile("servo")[0])
     drift = Drift(name="field", change=31.0, standard_uncertainty=11.0, unit="nT")
     finding = Finding(id="field-drift", text="readings follow the order")
-    possible = (
-        "a possible drift within the run (noise alone shows one in about three of ten steady runs)"
-    )
+    possible = "a possible drift within the run (noise alone shows one in a fifth to a third of steady runs)"
     for more, shown in (
         ({"drift": []}, False),
         ({"drift": [drift]}, True),
@@ -327,8 +325,8 @@ def test_a_trend_that_would_hardly_show_is_seldom_seen_in_noise():
     drifted, _ = drifting(fit(thermal(8, tools, 0.0), options), options)
     trends, walks = drifted.mean(0)
     assert np.all(trends < 0.01 + 3 * np.sqrt(0.01 * 0.99 / tools))
-    assert np.all(walks < 0.2 + 3 * np.sqrt(0.2 * 0.8 / tools))
-    assert np.all(walks > 0.05)
+    assert np.all(walks < 0.1 + 3 * np.sqrt(0.1 * 0.9 / tools))
+    assert np.all(walks > 0.02)
 
 
 def offset_errors(result):

@@ -250,7 +250,7 @@ def _possible(calibration: Calibration) -> str:
         for each in calibration.drift
         if each.declared is msgspec.UNSET and f"{each.name}-drift" not in named
     ]
-    words = "a possible drift within the run (noise alone shows one in about three of ten steady runs), which the "
+    words = "a possible drift within the run (noise alone shows one in a fifth to a third of steady runs), which the "
     words += "uncertainty includes and a plan does not foresee"
     return f"{words}: {', '.join(sizes)}" if sizes else ""
 

@@ -38,9 +38,10 @@ ORDER_CHANCE = 0.2
 """Chance of residuals that follow the order of stations as much in noise, below which a drift is fitted.
 
 One that is left out costs coverage: of walks as large as the noise of a reading 95 % intervals hold 90 % at a chance
-of 0.1 and 93 % at 0.2. One that is not there costs width, over tools without drift 6 % on average where a trend would
-show and 30 to 40 % where not; the errors of the angles stay as they are.
+of 0.1 and 93 % at 0.2. One that is not there costs width, 6 % on average over tools without drift.
 """
+HIDDEN_CHANCE = 0.1
+"""The same chance where a trend would not show: a walk that is not there then widens the uncertainty three times."""
 TREND_CHANCE = 0.01
 """Chance of as much of a trend, of which little would show, below which it is fitted.
 
@@ -66,11 +67,12 @@ REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
 
-def chances(result: Fit) -> tuple[Array, Bools]:
+def chances(result: Fit) -> tuple[Array, Bools, Bools]:
     """Probability (B, t) that noise alone follows the order of stations as the residuals of a triad do.
 
-    The least of those of the walks that act on a triad, times their number; and whether its trends can be fitted
-    (B, t). That of a trend counts where little of it would show, if it is below `TREND_CHANCE`.
+    The least of those of the walks that act on a triad, times their number; whether a trend would not show (B, t), and
+    whether trends can be fitted (B, t). That of a trend counts where little of it would show, if it is below
+    `TREND_CHANCE`.
     """
     analysis = result.analysis
     least, hidden = np.ones(analysis.freedom.shape), np.zeros(analysis.freedom.shape, bool)
@@ -93,7 +95,7 @@ def chances(result: Fit) -> tuple[Array, Bools]:
                 straight[:, triad] |= seen
             least[:, triad] = np.minimum(least[:, triad], one)
             hidden[:, triad] |= little
-    return least, straight | ~hidden
+    return least, hidden, straight | ~hidden
 
 
 def chances_without_drift(result: Fit, options: Options) -> Array:
@@ -153,11 +155,12 @@ def drifting(result: Fit, options: Options) -> tuple[Bools, Bools]:
         return drifted, wrong
     part = result if sound.all() else take(result, np.flatnonzero(sound))
     alone, disputed = _undisputed(part, options)
-    chance, straight = chances(alone)
-    shown = chance < np.where(disputed, DISPUTED_CHANCE, ORDER_CHANCE)[:, None]
+    chance, hidden, straight = chances(alone)
+    limit = np.where(hidden, HIDDEN_CHANCE, ORDER_CHANCE)
+    shown = chance < np.where(disputed[:, None], DISPUTED_CHANCE, limit)
     off = np.zeros(len(shown), bool)
     for places, free in _by_constant_errors(alone, np.flatnonzero(shown.any(-1)), options):
-        chance, straight[places] = chances(free)
+        chance, _, straight[places] = chances(free)
         shown[places], off[places] = chance < DISPUTED_CHANCE, True
     drifted[sound], wrong[sound] = np.stack([shown & straight, shown], 1), off
     return drifted, wrong
