@@ -759,6 +759,22 @@ def test_an_even_plan_is_even_and_no_better_than_the_best():
     assert ratio == pytest.approx(1.5**0.5)
 
 
+def test_the_screen_says_which_drift_the_order_of_the_stations_would_hide(tmp_path):
+    """A plan that only warms cannot tell a drift from temperature; one that returns to its first temperature can."""
+    plan = tmp_path / "plan.toml"
+    for levels, hidden in (("25, 55, 85", True), ("25, 55, 85, 55, 25", False)):
+        plan.write_text(
+            f'name = "p"\ntemperature_c = [{levels}]\n[[stations]]\ninclination_deg = [5, 45, 90, 135]\n'
+            "azimuth_deg = 0\ntoolface_deg = [0, 60, 120, 180, 240, 300]\n",
+            "utf-8",
+        )
+        made = mwdcal("plan", "--plan", plan, "--tool", "servo", "--order", 2)
+        assert made.code == 0, made
+        words = "as the order of the stations would hide a drift: accelerometer offsets"
+        assert (words in made.out) == hidden
+        assert ("0.1 mg of the accelerometer" in made.out) == hidden
+
+
 def test_the_screen_says_what_is_assumed_and_how_long_the_soak_is(tmp_path):
     plan = tmp_path / "p.toml"
     plan.write_text('name = "p"\ndip_deg = 60\n[[stations]]\ninclination_deg = [5, 60, 120]\n'

@@ -25,6 +25,7 @@ from mwdcal.calibration.options import ASSUMED_PRACTICE, DIRECTION, Options, is_
 from mwdcal.calibration.prior import PriorInformation
 from mwdcal.calibration.readings import TRIADS, WORDS, Readings, is_simulated, serial_of
 from mwdcal.calibration.record import (
+    LEAST_DRIFT,
     NOISE,
     SOFTWARE,
     BudgetRow,
@@ -45,6 +46,7 @@ from mwdcal.calibration.record import (
 from mwdcal.calibration.residuals import error_rows, measure_rows
 from mwdcal.calibration.results import accuracy
 from mwdcal.errors import FitError, MwdcalError
+from mwdcal.estimation import drift
 from mwdcal.estimation.batch import batch_of_one, mapped
 from mwdcal.estimation.problem import STAND_ERRORS, WALK_AXES, WALKS
 from mwdcal.geometry.vectors import Array, diagonal
@@ -328,15 +330,19 @@ def _constants(result: Fit) -> list[list[Constant]]:
 
 
 def _drifts(result: Fit, field_unit: str) -> list[list[Drift]]:
-    """How far field and offsets drifted within each run."""
+    """How far field and offsets drifted within each run, but for drifts that are as good as none."""
     declared = result.problem.evidence.drift
     drifts: list[list[Drift]] = [[] for _ in result.status]
+    noise = drift.noise(result.problem)
     for name, (change, sd) in results.drifts(result).items():
         factor, unit = _shown_drift(name, field_unit)
         size = declared.get(name, np.zeros(len(change)))
         numbers = (figures(each * factor) for each in (change, sd, size))
-        for each, moved, uncertainty, stated_size in zip(drifts, *numbers, strict=True):
-            each.append(
+        counts = (size > 0) | (np.hypot(change, sd) > LEAST_DRIFT * noise[name])
+        for place, (moved, uncertainty, stated_size) in enumerate(zip(*numbers, strict=True)):
+            if not counts[place]:
+                continue
+            drifts[place].append(
                 Drift(
                     name=name.removesuffix("-drift"),
                     change=moved,

@@ -205,6 +205,8 @@ def figures(values: Array) -> Any:
 
 SHOWN_DRIFT = 3.0
 """A drift is a finding if it is so many times its standard uncertainty; smaller ones are in the uncertainty too."""
+LEAST_DRIFT = 0.01
+"""Smallest drift, with its 1σ, that is stated, as a share of the noise of a reading: a smaller one moves no angle."""
 
 LEAST_ADDED = 5e-5
 """Smallest effect of a drift on an angle that is named, degrees…"""

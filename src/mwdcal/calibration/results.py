@@ -535,11 +535,13 @@ def unseen_drifts(result: Fit) -> dict[str, Bools]:
 
 
 def _unseen_drifts(result: Fit) -> dict[str, Bools]:
-    present = drift.places(result.problem.evidence)
-    if result.analysis.influence is not None or {*drift.families(result.problem)} <= {*present}:
+    if result.analysis.influence is not None:
         return {}
+    unseen = drift.held_trends(result.problem)
+    if {*drift.families(result.problem)} <= {*unseen}:
+        return unseen
     scores = drift.walk_scores(result.problem, result.state, result.analysis)
-    return {name: scores.shown(name) < drift.LEAST_TREND for name in scores.places}
+    return unseen | {name: scores.shown(name) < drift.LEAST_TREND for name in scores.places}
 
 
 def unseen_shares(result: Fit) -> dict[str, Array]:

@@ -44,6 +44,8 @@ LEAST_KEPT = 1e-6
 """Share of the information about a trend that is more than rounding."""
 LEAST_WALK = 1e-3
 """A walk over the run is at least this share of the noise of a reading: a smaller one does not count."""
+HELD_TREND = 1e-5
+"""A trend that is not fitted beside a walk, as a share of the noise of a reading."""
 FEWEST_USED = 2.0
 """Fewest degrees of freedom that are counted to the estimate of a walk's variance."""
 ROUNDING = 1e-13
@@ -119,6 +121,15 @@ def places(evidence: Evidence) -> dict[str, Ints]:
         for walk, axes in WALKS.items()
     }
     return {walk: index.reshape(3, -1) for walk, index in each.items() if index.size}
+
+
+def held_trends(problem: Problem) -> dict[str, Bools]:
+    """Members (B,) whose drift is fitted without its trend, by the drift."""
+    evidence, least = problem.evidence, noise(problem)
+    return {
+        name: evidence.constants[index[0, 1]].sd < LEAST_WALK / 10 * least[name]
+        for name, index in places(evidence).items()
+    }
 
 
 def noise(problem: Problem) -> dict[str, Array]:
@@ -370,12 +381,17 @@ def _eigen_alike(matrix: Array) -> tuple[Array, Array]:
 
 
 def walk_variances(
-    scores: WalkScores, variance: Array, freedom: Array, declared: Bools, least: Array
+    scores: WalkScores,
+    variance: Array,
+    freedom: Array,
+    declared: Bools,
+    least: Array,
+    held: Bools,
 ) -> tuple[Array, Array]:
     """Variances (B, c) of the components of the drifts in units of the noise, and of the noise (B, t): REML.
 
     `variance` (B, t) is s² of the fit without walks, of so many degrees of `freedom`; that of the noise
-    stays 1 where it is `declared`. None of a drift is below its `least` (B, c).
+    stays 1 where it is `declared`. None of a drift is below its `least` (B, c); where `held` (c,) it is that.
     Definition: for the coefficients u of a walk, V their covariance given the readings: θ = Σu² / Σ(1 - V/θ);
     of the noise, misfit less what the walks explain over its degrees of freedom (Henderson).
     """
@@ -385,7 +401,7 @@ def walk_variances(
         (lower, quiet), (upper, left) = (
             walk_variances(
                 scores.of([n for n, t in of_walk.items() if t == one]),
-                variance, freedom, declared, least[:, triad == one],
+                variance, freedom, declared, least[:, triad == one], held[triad == one],
             )
             for one in (0, 1)
         )  # fmt: skip
@@ -398,13 +414,15 @@ def walk_variances(
     misfit = variance * freedom
     left = np.where(declared, 1.0, variance)
     first = [scores.square(columns) for columns in parts.values()]
+    floor = np.maximum(least, np.where(held, HELD_TREND, LEAST_WALK) ** 2)
     theta = np.stack([np.maximum(q - m, 0.1 * m) / s for q, m, s in first], -1)
-    ridge, floor = _Ridge.of(scores, max(parts.values(), key=len)), np.maximum(least, LEAST_WALK**2)
+    theta = np.where(held, floor, theta)
+    ridge = _Ridge.of(scores, max(parts.values(), key=len))
     for _ in range(VARIANCE_ROUNDS):
         ratio = (left[:, triad] / theta)[:, owner]
         value, known = ridge.at(ratio)
         used = (1 - known * ratio) @ of
-        theta = np.maximum(value**2 @ of / np.maximum(used, 1e-9), floor)
+        theta = np.maximum(np.where(held, 0.0, value**2 @ of / np.maximum(used, 1e-9)), floor)
         explained = (value * ridge.score) @ of
         by_triad = np.stack([explained[:, triad == t].sum(-1) for t in range(misfit.shape[-1])], -1)
         left = np.where(declared, 1.0, np.maximum((misfit - by_triad) / freedom, 1e-3 * variance))

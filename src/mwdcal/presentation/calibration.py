@@ -192,9 +192,8 @@ def screen(
 
 def remarks(calibration: Calibration) -> list[str]:
     """Size of the residuals, accuracy to expect, and estimated constants; below, what the run cannot show."""
-    names, steady = exact_and_steady(calibration.assumed_exact)
-    exact = ", ".join(names)
-    lean, unseen, *included = unseen_remarks(calibration)
+    exact = ", ".join(exact_and_steady(calibration.assumed_exact)[0])
+    lean, _, *included = unseen_remarks(calibration)
     shown = [
         *residuals(calibration),
         *(north_in_words(calibration) if AZIMUTH_KEYS[0] in calibration.tool else []),
@@ -211,8 +210,7 @@ def remarks(calibration: Calibration) -> list[str]:
     hidden = [
         f"Assumed exact; this run cannot check it: {exact}{PROFILE}" if exact else "",
         lean,
-        steady.replace(". ", ".\n  "),
-        unseen.replace(": ", ":\n  ", 1).replace("; ", "\n  "),
+        *steadiness(calibration),
         ASSUMED if calibration.settings == ASSUMED_PRACTICE else "",
     ]
     return ["\n".join(filter(None, lines)) for lines in (shown, hidden) if any(lines)]
@@ -224,6 +222,13 @@ def north_in_words(calibration: Calibration) -> list[str]:
     angles = ", ".join(f"{name} {angle} ({source})" for name, angle, source in stated)
     kind = calibration.tool.get(AZIMUTH_KEYS[0])
     return [f"azimuths of the run from {kind} north: {angles}"]
+
+
+def steadiness(calibration: Calibration) -> list[str]:
+    """Blocks of lines on the drifts that a run would not show, and on their effect; or blank."""
+    _, steady = exact_and_steady(calibration.assumed_exact)
+    unseen = blindness(calibration.unseen).replace(": ", ":\n  ", 1).replace("; ", "\n  ")
+    return [steady.replace(". ", ".\n  "), unseen]
 
 
 def unseen_remarks(calibration: Calibration) -> list[str]:
@@ -245,7 +250,7 @@ def _possible(calibration: Calibration) -> str:
         for each in calibration.drift
         if each.declared is msgspec.UNSET and f"{each.name}-drift" not in named
     ]
-    words = "a possible drift within the run (noise alone shows one in about a fifth of steady runs), which the "
+    words = "a possible drift within the run (noise alone shows one in a fifth to a third of steady runs), which the "
     words += "uncertainty includes and a plan does not foresee"
     return f"{words}: {', '.join(sizes)}" if sizes else ""
 

@@ -22,7 +22,7 @@ from mwdcal.geometry.vectors import Array, Ints, reference_vectors
 from mwdcal.planning.expected import left_undetermined, planned_earth
 from mwdcal.planning.planned import Planned, station_names
 from mwdcal.planning.plans import attitudes, place_of, soak_numbers, soak_temperatures
-from mwdcal.presentation.calibration import PLACE
+from mwdcal.presentation.calibration import PLACE, steadiness
 from mwdcal.presentation.envelope import json_document
 from mwdcal.presentation.numbers import capital, files_written, quantity
 from mwdcal.presentation.page import banner, rendered
@@ -275,7 +275,8 @@ def screen(
         table(comparison_rows(summaries), ["", *(one_line(each.plan) for each in summaries)]),
     ]
     lines = [*_assumed(plans[0]), *_temperatures(plans), *_practice(summaries)]
-    lines += [*_inclinations(plans[0]), *_far(plans), f"D-efficiency: {EFFICIENCY}"]
+    lines += [*_steadiness(plans), *_inclinations(plans[0]), *_far(plans)]
+    lines.append(f"D-efficiency: {EFFICIENCY}")
     blocks += filter(None, ["\n".join(lines)])
     if len(plans) == 1:
         blocks += [accuracy(summaries[0]), detectable(summaries[0]), stations(plans[0])]
@@ -331,6 +332,15 @@ def _temperatures(plans: Sequence[Planned]) -> list[str]:
             at = ", ".join(f"{soak:.0f}" for soak in soak_temperatures(each.plan))
             whose = f"{one_line(each.plan.source)}: " if len(plans) > 1 else ""
             lines.append(f"{whose}planned at {at} °C; {GOOD_FOR.format(*valid)}")
+    return lines
+
+
+def _steadiness(plans: Sequence[Planned]) -> list[str]:
+    """The drifts that the order of each plan would hide, and their effect, as lines."""
+    lines = []
+    for each in plans:
+        whose = f"{one_line(each.plan.source)}: " if len(plans) > 1 else ""
+        lines += [whose + block for block in steadiness(each.calibration) if block]
     return lines
 
 

@@ -2,7 +2,8 @@
 
 A run is looked at without drift first. Where its residuals follow the order of the stations more than noise
 does, walks of the field and of both triads' offsets are fitted with it, of sizes that the run itself tells.
-A declared drift is part of every fit, and no smaller than declared.
+A trend joins a walk unless it is as good as lost in terms of temperature, whose accuracy it takes away as an unknown:
+then it needs evidence of its own. A declared drift is part of every fit, and no smaller than declared.
 """
 
 from __future__ import annotations
@@ -42,10 +43,15 @@ of 0.1 and 93 % at 0.2. One that is not there costs width, 9 % on average over t
 HIDDEN_CHANCE = 0.1
 """The same chance where a trend would not show: a drift then widens the uncertainty many times, on less evidence."""
 TREND_CHANCE = 0.05
-"""Chance of as much of a trend, of which little would show, below which it is a drift whatever its walk says.
+"""Chance of as much of a trend, of which little would show, below which it is a drift whatever its walk says."""
+LOST_TREND = 0.03
+"""Share of a trend that residuals keep, below which it joins the fit on its own evidence alone.
 
-A trend of a run that goes from soak to soak looks like a term of temperature, but for what is left within the soaks.
+In a run that only warms it looks like a term of temperature, but for what is left within the soaks. One that is not
+there makes the angles 5 to 25 times worse.
 """
+LOST_CHANCE = 0.01
+"""Chance of as much of such a trend: in steady runs that only warm 0.05 shows one in seven, 0.01 one in sixty."""
 PRIOR_CHANCE = 1e-3
 """Chance of so large a departure from the prior, at which a drift is looked for in the run alone."""
 DISPUTED_CHANCE = 0.01
@@ -65,14 +71,16 @@ REDUNDANCY = 36.0
 """Fewest degrees of freedom of a triad that can tell a drift from noise."""
 
 
-def chances(result: Fit) -> tuple[Array, Bools]:
+def chances(result: Fit) -> tuple[Array, Bools, Bools]:
     """Probability (B, t) that noise alone follows the order of stations as the residuals of a triad do.
 
-    The least of those of the walks that act on a triad, times their number; and whether a trend would not show (B, t).
-    That of a trend counts where little of it would show, if it is below `TREND_CHANCE`.
+    The least of those of the walks that act on a triad, times their number; whether a trend would not show (B, t), and
+    whether trends can be fitted (B, t). That of a trend counts where little of it would show, if it is below
+    `TREND_CHANCE`, or `LOST_CHANCE` of one that is as good as lost.
     """
     analysis = result.analysis
     least, hidden = np.ones(analysis.freedom.shape), np.zeros(analysis.freedom.shape, bool)
+    shown, held = np.zeros_like(hidden), np.zeros_like(hidden)
     for scores, trends in _scores(result):
         for name, triad in drift.acting(scores.places).items():
             scatter, rest = (x[:, triad] for x in (analysis.variance_factor, analysis.freedom))
@@ -86,10 +94,14 @@ def chances(result: Fit) -> tuple[Array, Bools]:
                 three, factor = np.full(1, 3.0), np.nan_to_num(scatter)
                 trend = np.nan_to_num(f_test(scores.trend(name), three, factor, rest), nan=1.0)
                 trend *= 1 + (triad > 0)
-                one = np.where(seen & (trend < TREND_CHANCE), np.minimum(one, trend), one)
+                lost = trends[name] < LOST_TREND
+                seen = seen & (trend < np.where(lost, LOST_CHANCE, TREND_CHANCE))
+                one = np.where(seen, np.minimum(one, trend), one)
+                shown[:, triad] |= seen
+                held[:, triad] |= lost
             least[:, triad] = np.minimum(least[:, triad], one)
             hidden[:, triad] |= little
-    return least, hidden
+    return least, hidden, shown | ~held
 
 
 def chances_without_drift(result: Fit, options: Options) -> Array:
@@ -132,12 +144,14 @@ def _of_units(design: Alike, axes: int) -> tuple[drift.WalkScores, dict[str, Arr
 
 
 def drifting(result: Fit, options: Options) -> tuple[Bools, Bools]:
-    """Triads (B, t) whose readings drifted within the run, and whether (B,) the run shows constant errors besides.
+    """Triads whose readings drifted within the run, and whether (B,) the run shows constant errors besides.
+
+    (B, 2, t): by a trend that can be fitted, and by a walk.
 
     None where parameters are held: what these would take up follows the attitudes, and so the order of stations.
     """
-    drifted = np.zeros(result.analysis.freedom.shape, bool)
-    wrong = np.zeros(len(drifted), bool)
+    batch, triads = result.analysis.freedom.shape
+    drifted, wrong = np.zeros((batch, 2, triads), bool), np.zeros(batch, bool)
     if _apart(result, options):
         return drifted, wrong
     sound = (result.status == int(Status.OK)) & result.analysis.finite
@@ -147,13 +161,14 @@ def drifting(result: Fit, options: Options) -> tuple[Bools, Bools]:
         return drifted, wrong
     part = result if sound.all() else take(result, np.flatnonzero(sound))
     alone, disputed = _undisputed(part, options)
-    chance, hidden = chances(alone)
+    chance, hidden, straight = chances(alone)
     limit = np.where(hidden, HIDDEN_CHANCE, ORDER_CHANCE)
-    limit = np.where(disputed[:, None], DISPUTED_CHANCE, limit)
-    shown, off = chance < limit, np.zeros(len(limit), bool)
+    shown = chance < np.where(disputed[:, None], DISPUTED_CHANCE, limit)
+    off = np.zeros(len(shown), bool)
     for places, free in _by_constant_errors(alone, np.flatnonzero(shown.any(-1)), options):
-        shown[places], off[places] = chances(free)[0] < DISPUTED_CHANCE, True
-    drifted[sound], wrong[sound] = shown, off
+        chance, _, straight[places] = chances(free)
+        shown[places], off[places] = chance < DISPUTED_CHANCE, True
+    drifted[sound], wrong[sound] = np.stack([shown & straight, shown], 1), off
     return drifted, wrong
 
 
@@ -225,8 +240,8 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
         declared = bool(result.problem.walks) and not _apart(result, options)
         steady = _without_drift(result, options) if declared else result
         drifted, wrong = drifting(steady, options)
-        wrong &= drifted.any(-1)
-        kinds = np.column_stack([drifted, wrong])
+        wrong &= drifted.any((1, 2))
+        kinds = np.column_stack([drifted.reshape(len(drifted), -1), wrong])
         for kind in distinct(kinds, axis=0):
             places, triads = np.flatnonzero((kinds == kind).all(-1)), kind[:-1]
             part = steady if triads.any() else result
@@ -241,7 +256,7 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
         for first in range(0, len(every), TOGETHER):
             some = slice(first, first + TOGETHER)
             for places, result in _with_possible_drift(
-                take(whole, some), options, np.array(triads), off
+                take(whole, some), options, np.reshape(triads, (2, -1)), off
             ):
                 yield every[some][places], _whole(result, options)
 
@@ -291,6 +306,7 @@ def _without_drift(result: Fit, options: Options) -> Fit:
 def with_drift(result: Fit, options: Options, triads: Bools, wrong: bool = False) -> Fit:
     """A fit with walks of estimated size that act on some triads (t,), from one without.
 
+    `triads` (2, t): those with a trend, and those with a walk.
     The noise is estimated with the walks in the fit. Where the references are `wrong` by constant errors it stays as
     the fit without walks has it: they are part of it.
     """
@@ -308,6 +324,7 @@ def with_drift(result: Fit, options: Options, triads: Bools, wrong: bool = False
 
 def _sized(result: Fit, triads: Bools) -> tuple[dict[str, Array], Array]:
     """Trend and walk (B, 2) of each drift that acts on some triads (t,), and the variance of the noise left (B, t)."""
+    trends, triads = np.broadcast_to(triads, (2, triads.shape[-1]))
     problem, analysis = result.problem, result.analysis
     known, noise = declared_sizes(problem.evidence), drift.noise(problem)
     acting = drift.acting(drift.families(problem)).items()
@@ -315,8 +332,10 @@ def _sized(result: Fit, triads: Bools) -> tuple[dict[str, Array], Array]:
     scores = drift.walk_scores(problem, result.state, analysis, walks)
     parts = [(known.get(n, np.zeros((1, 2)))[:, i], noise[n]) for n, i in scores.components()]
     least = np.stack([(size / one) ** 2 for size, one in parts], -1)
+    lone = {name for name, triad in acting if triads[triad] and not trends[triad]}
+    held = np.array([name in lone and not part for name, part in scores.components()])
     theta, left = drift.walk_variances(
-        scores, analysis.variance_factor, analysis.freedom, np.isnan(result.noise), least
+        scores, analysis.variance_factor, analysis.freedom, np.isnan(result.noise), least, held
     )
     sizes = {name: np.zeros((len(theta), 2)) for name in scores.places}
     for (name, part), variance in zip(scores.components(), theta.T, strict=True):

@@ -173,8 +173,8 @@ REMARKS = {
     "ref_field_nt and ref_dip_deg of each station from a reference magnetometer, or repeat the run at a quiet time.",
     "drift": "Readings follow the order of the stations as if the offsets of the {triad} drifted by "
     "{change:.2g} {unit} (1σ {sd:.2g} {unit}) during the run{by_noise}. The fit allows for this drift, and the "
-    "uncertainty includes it. Let the tool warm up, and change inclination and azimuth in another order than "
-    "from end to end.",
+    "uncertainty includes it. Let the tool warm up, change inclination and azimuth in another order than from end "
+    "to end, and measure at the first temperature again at the end.",
     "column-explains": "The drift within the run goes with the column {column!r}, which is not used. If it is the "
     "temperature of the tool, name it 'temperature_c' (°C), or under [columns] of the tool profile; else find out what "
     "it stands for.",
