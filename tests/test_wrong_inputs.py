@@ -189,6 +189,18 @@ def test_a_left_handed_accelerometer_alone_is_said_unless_it_counts_upwards(tmp_
     assert ("left-handed" in findings(ran)) is said
 
 
+def test_azimuths_half_a_turn_off_are_a_cause_beside_the_sign_of_the_dip(tmp_path):
+    """A field turned by 180° of azimuth and of opposite dip is the field reversed; the table's azimuths are off."""
+    run = servo_run()
+    run["ref_azimuth_deg"] = (run["ref_azimuth_deg"] + 180) % 360
+    out = "-o", tmp_path / "t.toml"
+    message = refused(mwdcal("profile", write_csv(tmp_path / "r.csv", run), *out), 3)
+    assert "all azimuths of the stand are 180° off, or the sign of the dip is wrong" in message
+    run["ref_dip_deg"] = -run["ref_dip_deg"]
+    ran = mwdcal("profile", write_csv(tmp_path / "s.csv", run), *out, "--json")
+    assert "all azimuths of the stand are 180° off" in findings(ran)["left-handed"]
+
+
 # --------------------------------------------------------------------------------------- roll test
 
 

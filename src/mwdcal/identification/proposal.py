@@ -1320,6 +1320,7 @@ def _check_magnetic(
 
 _ANOTHER_DIP = 3.0
 """By how much a dip that is stated differs from that of the readings where it is of another place, degrees."""
+_OPPOSITE_DIP = "Either all azimuths of the stand are 180° off, or the sign of the dip is wrong."
 
 
 def _check_dip(table: Table, profile: Profile, answers: Collection[str]) -> None:
@@ -1344,9 +1345,11 @@ def _check_dip(table: Table, profile: Profile, answers: Collection[str]) -> None
         _, seen = field_direction(readings, {} if open_axes else wirings)
     if abs(seen - stated) > _ANOTHER_DIP:
         where = shown(named.name) if named else "a line above the table"
+        turned = abs(seen + stated) < _ANOTHER_DIP
+        question = _OPPOSITE_DIP if turned else "Is the latter that of another place or sign?"
         raise QuestionError(
-            f"{table.source}: by the readings the dip is {seen:.1f}°, and by {where} {stated:.1f}°. Is the latter that "
-            "of another place or sign? Correct a wrong sign in the table; a blank answer leaves the dip out, and the "
+            f"{table.source}: by the readings the dip is {seen:.1f}°, and by {where} {stated:.1f}°. {question} Correct "
+            f"{'the wrong one' if turned else 'a wrong sign'} in the table; a blank answer leaves the dip out, and the "
             "calibration finds it.",
             [
                 Answer(

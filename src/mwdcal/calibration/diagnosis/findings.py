@@ -276,16 +276,20 @@ def left_handed(axes: Mapping[str, Sequence[str]]) -> list[Finding]:
     """A finding on triads whose channels x, y, z are a left-handed set by their axes.
 
     Not on an accelerometer whose channels all read opposite to those of the magnetometer: positive upwards, as many do.
+    A magnetometer that reads so is that of a tool turned by 180° of azimuth, and named.
     """
     triads = [*compress(axes, map(is_left_handed, axes.values()))]
     if not triads:
         return []
     others = [kind for kind in axes if kind not in triads]
     opposite = [tuple(axis.translate(_OTHER_SIGN) for axis in axes[kind]) for kind in triads]
-    if others and opposite == [tuple(axes[others[0]])]:
+    reversed_whole = bool(others) and opposite == [tuple(axes[others[0]])]
+    if reversed_whole and triads == [TRIADS[0]]:
         return []
     reason = (
-        f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read roll "
+        "all azimuths of the stand are 180° off, and the dip has the wrong sign: correct both"
+        if reversed_whole
+        else f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read roll "
         "test and surveys with the same wiring"
         if others
         else "a reference angle counts the other way: toolface anticlockwise, or inclination from below"
