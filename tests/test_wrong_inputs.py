@@ -201,6 +201,24 @@ def test_azimuths_half_a_turn_off_are_a_cause_beside_the_sign_of_the_dip(tmp_pat
     assert "all azimuths of the stand are 180° off" in findings(ran)["left-handed"]
 
 
+@pytest.mark.parametrize(
+    ("turn", "names", "said"),
+    [(0, NAMES, False), (180, NAMES, True), (90, NAMES, True), (180, {"ax": "Accel 1 (V)"}, False)],
+)
+def test_a_tool_turned_in_the_stand_is_named_where_channels_say_their_axes(
+    tmp_path, turn, names, said
+):
+    """The stand's toolface is `turn` less than the tool's."""
+    run = servo_run()
+    run["ref_toolface_deg"] = (run["ref_toolface_deg"] - turn) % 360
+    table = write_csv(tmp_path / "r.csv", named(run, **names))
+    answers = ["--column", "ax=Accel 1 (V)"] if "1" in names["ax"] else []
+    ran = mwdcal("profile", table, "-o", tmp_path / "t.toml", "--json", *answers)
+    found = findings(ran)
+    assert ("turned-about-z" in found) is said
+    assert not said or f"turned by {turn}°" in found["turned-about-z"]
+
+
 # --------------------------------------------------------------------------------------- roll test
 
 

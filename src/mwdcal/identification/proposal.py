@@ -48,7 +48,7 @@ from mwdcal.files.formats.layout import NO_READING, WITHOUT_VALUE, Layout, warmt
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
-from mwdcal.files.formats.title_references import references_in
+from mwdcal.files.formats.title_references import references_in, sensitivity_in
 from mwdcal.files.marks import (
     MARKS_NAMED,
     UNMARKED,
@@ -1672,6 +1672,30 @@ def axes_open(proposal: Proposal) -> list[Finding]:
     ]
 
 
+_TURNS = {("-x", "-y", "+z"): 180, ("+y", "-x", "+z"): 90, ("-y", "+x", "+z"): 90}
+"""Degrees by which channels x, y, z read as turned about the tool's axis, by their axes."""
+
+
+def turned_about_z(proposal: Proposal) -> list[Finding]:
+    """A finding on triads whose channels, called x, y and z, all read as turned about z by one angle."""
+    columns = proposal.profile.columns or {}
+    turns = {_TURNS.get(each.axes, 0) for each in proposal.wirings.values()}
+    names = {
+        c: columns[c].name if c in columns else c
+        for kind in proposal.wirings
+        for c in CHANNELS[kind]
+    }
+    plain = all(re.search(rf"(?i:{c[1]})(?![^\W\d_])", name) for c, name in names.items())
+    if len({each.axes for each in proposal.wirings.values()}) != 1 or turns == {0} or not plain:
+        return []
+    turn = turns.pop()
+    text = (
+        f"the channels X and Y of {' and '.join(proposal.wirings)} read as turned by {turn}° about Z. Either the tool "
+        f"is wired so, or the toolface zero of the stand is {turn}° off (mark down?): then toolfaces of surveys are, too."
+    )
+    return [Finding(id="turned-about-z", text=text)]
+
+
 def one_inclination(proposal: Proposal) -> list[Finding]:
     """A finding on a table whose inclinations are too close to each other for a calibration."""
     if proposal.level is None:
@@ -1751,18 +1775,31 @@ def units_contradicted(proposal: Proposal) -> list[Finding]:
             )
             findings.append(Finding(id="unit-contradicted", text=text))
         scale = getattr(proposal.profile, kind).scale if kind in proposal.wirings else None
-        if not channel or not scale or channel.unit not in (base, *FACTORS):
-            continue
-        if (kind, channel.unit) == ("accelerometer", "mG"):
-            channel = msgspec.structs.replace(channel, unit="mg")
-        per_unit = 1 / FACTORS.get(channel.unit, (1.0, 0.0))[0]
-        if abs(np.log(scale / per_unit)) > OFF_UNIT:
+        nominal = _nominal_scale(proposal, channel, base) if channel else None
+        if nominal and scale and abs(np.log(scale / nominal[0])) > OFF_UNIT:
+            strength = stated_references(proposal).get("ref_field_nt" if base == "nT" else "", 0.0)
             text = (
-                f"{kind}: by its names {channel.unit}, of which {per_unit:g} make a {base}; by readings and references "
-                f"{scale:g} do. It is used in the scale of the readings. Check the unit and the references."
+                f"{kind}: {nominal[1]}; by readings and references {scale:g} do. It is used in the scale of the "
+                f"readings. Check the unit and the references{f': is the field {strength:g} nT?' if strength else '.'}"
             )
             findings.append(Finding(id="unit-contradicted", text=text))
     return findings
+
+
+def _nominal_scale(
+    proposal: Proposal, channel: ColumnSource, base: str
+) -> tuple[float, str] | None:
+    """The scale that the unit of a channel is, or a line above the names states, per g or nT, and where it is from."""
+    unit = "mg" if (base, channel.unit) == ("g", "mG") else channel.unit
+    if unit in (base, *FACTORS):
+        scale = 1 / FACTORS.get(unit, (1.0, 0.0))[0]
+        return scale, f"by its names {unit}, of which {scale:g} make a {base}"
+    lines = proposal.where.above if proposal.where else ()
+    stated = {s.scale for s in map(sensitivity_in, lines) if s and (s.raw, s.base) == (unit, base)}
+    if len(stated) != 1:
+        return None
+    scale = stated.pop()
+    return scale, f"by a line above the names {scale:g} {unit} make a {base}"
 
 
 def warmth_by_unit(proposal: Proposal) -> list[Finding]:
@@ -1819,6 +1856,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         + one_inclination(proposal)
         + axes_open(proposal)
         + left_handed({kind: each.axes for kind, each in proposal.wirings.items()})
+        + turned_about_z(proposal)
         + lines_not_taken(proposal)
         + marked
     )

@@ -289,8 +289,8 @@ def left_handed(axes: Mapping[str, Sequence[str]]) -> list[Finding]:
     reason = (
         "all azimuths of the stand are 180° off, and the dip has the wrong sign: correct both"
         if reversed_whole
-        else f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read roll "
-        "test and surveys with the same wiring"
+        else f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read "
+        "roll test and surveys with the same wiring"
         if others
         else "a reference angle counts the other way: toolface anticlockwise, or inclination from below"
     )
