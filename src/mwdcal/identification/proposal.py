@@ -1691,7 +1691,7 @@ def turned_about_z(proposal: Proposal) -> list[Finding]:
     turn = turns.pop()
     text = (
         f"the channels X and Y of {' and '.join(proposal.wirings)} read as turned by {turn}° about Z. Either the tool "
-        f"is wired so, or the toolface zero of the stand is {turn}° off (mark down?): then toolfaces of surveys are, too."
+        f"is wired so, or the toolface zero of the stand is {turn}° off (mark down?): then survey toolfaces are, too."
     )
     return [Finding(id="turned-about-z", text=text)]
 

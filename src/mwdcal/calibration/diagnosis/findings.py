@@ -246,13 +246,20 @@ def unused_columns(columns: Sequence[str]) -> list[Finding]:
     return [Finding(id=UNUSED, text=f"columns not used: {listed(columns, COLUMNS_NAMED)}.")]
 
 
+_OF_THE_EARTH = {
+    "ref_gravity_g": ", or no gravity on Earth (9.76 to 9.84 m/s²)",
+    "ref_field_nt": ", or no field on Earth (15,000 to 80,000 nT)",
+}
+"""A third reason why a line is not taken, by column of a run file."""
+
+
 def references_not_taken(lines: Mapping[str, str]) -> list[Finding]:
     """A finding on each line that may state a reference, by column of a run file, which is not stated otherwise."""
     return [
         Finding(
             id="reference-not-taken",
-            text=f"'{line}' is nominal or unclear, and not taken as '{column}', which the run does not state "
-            "otherwise. If it holds, state it plainly, or in a column.",
+            text=f"'{line}' is nominal or unclear{_OF_THE_EARTH.get(column, '')}, and not taken as '{column}', which the "
+            "run does not state otherwise. If it holds, state it plainly, or in a column.",
         )
         for column, line in lines.items()
     ]
