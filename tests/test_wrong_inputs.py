@@ -219,6 +219,20 @@ def test_a_tool_turned_in_the_stand_is_named_where_channels_say_their_axes(
     assert not said or f"turned by {turn}°" in found["turned-about-z"]
 
 
+@pytest.mark.parametrize("name", ["ref_toolface_deg", "ref_azimuth_deg"])
+@pytest.mark.parametrize(("first", "last"), [(8, 15), (0, 2)])
+def test_an_angle_half_a_turn_off_at_some_stations_is_named_with_their_rows(
+    tmp_path, name, first, last
+):
+    """Names stand in line 1 of the file, station 0 in line 2."""
+    run = servo_run()
+    run[name][first : last + 1] = (run[name][first : last + 1] + 180) % 360
+    table = write_csv(tmp_path / "r.csv", named(run))
+    message = refused(mwdcal("profile", table, "-o", tmp_path / "t.toml"), 3)
+    where = f"'{NAMES[name]}' is 180° off from line {first + 2} to line {last + 2}, and fits"
+    assert where in message
+
+
 # --------------------------------------------------------------------------------------- roll test
 
 

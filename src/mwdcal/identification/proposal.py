@@ -76,7 +76,7 @@ from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, OURS, WARMTH
 from mwdcal.geometry.circle import resultant
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
+from mwdcal.geometry.vectors import Array, Bools, Ints, tool_from_earth
 from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside
 from mwdcal.identification.columns import (
     MEASURED_BY_TOOL,
@@ -1067,6 +1067,7 @@ def _wired(
     columns = profile.columns
     assert not isinstance(columns, msgspec.UnsetType)
     _check_gravity(readings, columns)
+    _check_half_turns(run, readings, columns)
     wirings, open_axes = _wirings(run, readings, scaled)
     if "magnetometer" in open_axes:
         _check_sense(run, readings, scaled, columns)
@@ -1564,6 +1565,59 @@ def _check_gravity(readings: Readings, columns: Mapping[str, ColumnSource]) -> N
         f"as no local gravity does: {'a' if parts else 'the'} tool has measured it, and it is no reference.",
         [Answer("leave it out", tuple(("column", f"{c}=") for c in parts or [column]))],
     )
+
+
+_LEAST_TURNED = 3
+"""Consecutive stations from which on an angle that is half a turn off is no single slip."""
+
+
+def _check_half_turns(run: Table, readings: Readings, columns: Mapping[str, ColumnSource]) -> None:
+    """Refuse an angle that is half a turn off at consecutive stations, where the readings fit it at all others."""
+    for kind, name in (("accelerometer", "toolface"), ("magnetometer", "azimuth")):
+        column = REFERENCES[name].column
+        if column not in columns or getattr(readings, kind) is None:
+            continue
+        rows = _half_turned(readings, kind, name)
+        if len(rows) < _LEAST_TURNED:
+            continue
+        raise FitError(
+            f"{run.source}: by the readings {shown(columns[column].name)} is 180° off from {place(run, rows[0])} to "
+            f"{place(run, rows[-1])}, and fits at all other stations. Correct it there, or leave these rows out."
+        )
+
+
+def _half_turned(readings: Readings, kind: str, name: str) -> Ints:
+    """The stations, one behind the other, at which the readings of a triad fit an angle turned by 180° alone.
+
+    Each station counts as it fits the line of all better, until no more change. None where others lie between them,
+    where they are half of all, or where readings are left that neither angle explains.
+    """
+    none = np.empty(0, int)
+    turned = {**readings.known, name: readings.reference(name) + np.pi}
+    both = [
+        _regressors(each, kind, warm=False) for each in (readings, replace(readings, known=turned))
+    ]
+    raw = both[0][1]
+    designs = np.stack([np.column_stack([parts, np.ones(len(parts))]) for parts, _ in both])
+    count, width = designs.shape[1:]
+    if count < max(readings.count, 2 * _MOST_COLUMNS * width):
+        return none
+    chosen, off = np.zeros(count, int), np.zeros((2, count))
+    for _ in range(_MOST_ROUNDS):
+        slope, *_ = np.linalg.lstsq(designs[chosen, range(count)], raw, rcond=1e-9)
+        off = np.linalg.norm(raw - designs @ slope, axis=-1)
+        before, chosen = chosen, off.argmin(0)
+        if np.array_equal(before, chosen):
+            break
+    rows = np.flatnonzero(off[1] < _FAR_BETTER * off[0])
+    left = np.sqrt(np.mean(off.min(0) ** 2) / np.sum(raw.var(0)))
+    between = slice(rows.min(initial=count), rows.max(initial=-1) + 1)
+    apart = np.any(off[0, between] < _FAR_BETTER * off[1, between])
+    return none if apart or 2 * len(rows) >= count or left > _CONFIRMED else rows
+
+
+_MOST_ROUNDS = 20
+"""Times that stations are assigned to an angle or the one half a turn from it."""
 
 
 def _check_independent(readings: Readings, results: dict[str, Wiring]) -> None:
