@@ -68,3 +68,18 @@ def test_a_declination_that_is_not_understood_is_listed(line: str) -> None:
     block = stated_above([[line]])
     assert "declination_deg" not in block.metadata
     assert block.not_taken == {"declination_deg": line}
+
+
+@pytest.mark.parametrize(
+    ("row", "day"),
+    [
+        (["Dato", 46350], "2026-11-24"),
+        (["Date", "45658"], "2025-01-01"),
+        (["Datum:", 43890], "2020-02-29"),
+        (["Date", 20261], None),
+        (["Order", 46350], None),
+    ],
+)
+def test_a_number_beside_a_word_for_the_date_is_the_day_that_a_workbook_stores(row, day) -> None:
+    """Days of LibreOffice Calc: =DATE(2026;11;24) as a number is 46350."""
+    assert titles([row]).metadata.get("date") == day

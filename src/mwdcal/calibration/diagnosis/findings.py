@@ -61,7 +61,7 @@ from mwdcal.estimation.uncertainty import (
     station_misfit,
 )
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, quotient
-from mwdcal.sensor.profile import PRACTICES
+from mwdcal.sensor.profile import PRACTICES, Profile
 
 # --------------------------------------------------------------------------
 # Stations that repeat the readings of an earlier one more closely than noise allows: copies, not measurements.
@@ -329,6 +329,16 @@ def of_table(readings: Readings) -> list[Finding]:
     return [*marked, *unread, *absent, *unused_columns(readings.unused)]
 
 
+def angles_absent(profile: Profile, readings: Readings) -> list[Finding]:
+    """A finding on a run without any angle of the stand, where the profile names columns of these."""
+    if any(not np.isnan(readings.reference(name)).all() for name in ANGLES):
+        return []
+    columns = profile.columns or {}
+    names = [f"'{columns[c].name}'" for n in ANGLES if (c := f"ref_{n}_deg") in columns]
+    text = f"the table has no angles of the stand: the tool profile's columns {listed(names, len(names))} are absent."
+    return [Finding(id="angles-absent", text=text)] if names else []
+
+
 def findings(flags: Iterable[Flag], place: int, labels: Sequence[str]) -> list[Finding]:
     """The findings of one run, in order of weight, of the `flags` of its batch; `labels` of its stations."""
     return [
@@ -366,7 +376,8 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     both = [profile.accelerometer.axes, profile.magnetometer.axes]
     axes = dict(zip(TRIADS, both[:count], strict=False))
     turned = both[:count].count(("+x", "+y", "+z")) < count
-    for each in [*(left_handed(axes) if turned else ()), *of_table(fitted.readings)]:
+    of_run = [*angles_absent(profile, fitted.readings), *of_table(fitted.readings)]
+    for each in [*(left_handed(axes) if turned else ()), *of_run]:
         yield _common(fitted, each.id, each.text, range(fitted.count))
     yield from _culprits(fitted)
     yield _distrusted(fitted)

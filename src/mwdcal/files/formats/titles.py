@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from datetime import datetime
+from datetime import date, datetime, timedelta
 from typing import NamedTuple
 
 import numpy as np
@@ -263,7 +263,7 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
             if not value or key in metadata:
                 continue
             if key == "date":
-                day = day_of(value, not _ENGLISH_DATE.match(cell))
+                day = day_of(value, not _ENGLISH_DATE.match(cell)) or _day_of_number(value)
                 unclear = unclear or ("" if day else value)
                 value = day
             if value:
@@ -413,6 +413,21 @@ def day_of(text: str, day_first: bool = False) -> str:
     orders = [(one, two)] if day_first else [(two, one)] if american else [(one, two), (two, one)]
     days = {f"{match[4]}-{m:02d}-{d:02d}" for d, m in orders if 0 < m <= 12 and 0 < d <= 31}
     return days.pop() if len(days) == 1 else ""
+
+
+_DAY_NUMBERS = (36_526, 73_050)
+"""Numbers that a workbook has for the first day of 2000 and for the last of 2099."""
+
+
+def _day_of_number(text: str) -> str:
+    """The day of a number of days since 30 December 1899, as a workbook stores it; empty where it is no such number.
+
+    >>> _day_of_number("46350"), _day_of_number("2026")
+    ('2026-11-24', '')
+    """
+    days = int(text) if re.fullmatch(r"\d{5}", text) else 0
+    first, last = _DAY_NUMBERS
+    return (date(1899, 12, 30) + timedelta(days)).isoformat() if first <= days <= last else ""
 
 
 def dated(
