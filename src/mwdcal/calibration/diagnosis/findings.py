@@ -258,8 +258,8 @@ def references_not_taken(lines: Mapping[str, str]) -> list[Finding]:
     return [
         Finding(
             id="reference-not-taken",
-            text=f"'{line}' is nominal or unclear{_OF_THE_EARTH.get(column, '')}, and not taken as '{column}', which the "
-            "run does not state otherwise. If it holds, state it plainly, or in a column.",
+            text=f"'{line}' is nominal or unclear{_OF_THE_EARTH.get(column, '')}, and not taken as '{column}', which "
+            "the run does not state otherwise. If it holds, state it plainly, or in a column.",
         )
         for column, line in lines.items()
     ]
