@@ -1726,14 +1726,18 @@ def axes_open(proposal: Proposal) -> list[Finding]:
     ]
 
 
-_TURNS = {("-x", "-y", "+z"): 180, ("+y", "-x", "+z"): 90, ("-y", "+x", "+z"): 90}
+_TURNS_ABOUT_Z: dict[tuple[str, ...], int] = {
+    ("-x", "-y", "+z"): 180,
+    ("+y", "-x", "+z"): 90,
+    ("-y", "+x", "+z"): 90,
+}
 """Degrees by which channels x, y, z read as turned about the tool's axis, by their axes."""
 
 
 def turned_about_z(proposal: Proposal) -> list[Finding]:
     """A finding on triads whose channels, called x, y and z, all read as turned about z by one angle."""
     columns = proposal.profile.columns or {}
-    turns = {_TURNS.get(each.axes, 0) for each in proposal.wirings.values()}
+    turns = {_TURNS_ABOUT_Z.get(each.axes, 0) for each in proposal.wirings.values()}
     names = {
         c: columns[c].name if c in columns else c
         for kind in proposal.wirings
