@@ -469,7 +469,7 @@ def test_few_degrees_of_freedom_widen_the_guard_band_the_coverage_and_the_risk(s
 
 def test_a_raw_figure_is_marked_and_has_no_uncertainty_beyond_its_limit(servo):
     """t(95 %, 1) = 12.71 of a table: within the limit the U decides, beyond it 7.6° would say nothing of 1.3°."""
-    words = "curve at toolface 90°; raw figure judged: the readings leave a smooth curve by 6.5 × their noise"
+    words = "largest at toolface 90°; raw figure judged: the readings leave a smooth curve by 6.5 × their noise"
     raw = replace(row(1.3, 0.6, 1.0), note=words, raw=1.3, degrees_of_freedom=1.0, passed=False)
     within = replace(raw, name="error of azimuth", value=0.7, raw=0.7, limit=1.0)
     smooth = row(name="error of inclination")

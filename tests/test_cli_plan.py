@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 
+import mwdcal as library
 from cli_support import EXAMPLE, RAW, SCALE, SERVO_NOISE, mwdcal, refused, servo_run, write_csv
 from simulation import DEG, Tool
 
@@ -160,6 +161,7 @@ def test_the_next_stations_of_a_run_are_better_than_others(tmp_path):
         (("--plan", "nine-state"), 2, "twelve-state"),
         (("--plan", "one.toml"), 3, "would read the same at all 6 stations"),
         (("--plan", "empty.toml"), 2, "this one has 0"),
+        (("--plan", "bare.toml"), 2, "'toolface_deg' belongs below a line [[stations]]."),
         (("--plan", "million.toml"), 2, "this one has 1000000"),
         (("--plan", "million.toml", "--stations", 24), 2, "this one has 1000000"),
         (
@@ -192,6 +194,7 @@ def test_what_cannot_be_planned_ends_in_one_sentence(tmp_path, monkeypatch, argu
     monkeypatch.chdir(tmp_path)
     (tmp_path / "one.toml").write_text(ONE_ATTITUDE)
     (tmp_path / "empty.toml").write_text("name = 'empty'\nstations = []\n")
+    (tmp_path / "bare.toml").write_text("toolface_deg = [0, 90, 180, 270]\n")
     (tmp_path / "million.toml").write_text(MILLION)
     (tmp_path / "accelerometer.csv").write_text("ref_inclination_deg,ax,ay,az\n10,0,0,0\n")
     message = refused(mwdcal("plan", *arguments, "--tool", "servo", "-o", "plan.csv"), code)
@@ -243,7 +246,12 @@ def test_a_plan_says_its_temperatures_and_what_it_lacks_of_the_calibration(tmp_p
     run = write_csv(tmp_path / "run.csv", servo_run(temperatures=(30.0, 50.0, 70.0)))
     cal = tmp_path / "cal.json"
     assert mwdcal("calibrate", run, "--tool", "servo", "--order", 1, "-o", cal).code == 0
-    ran = mwdcal("plan", "--tool", cal)
+    sheet = tmp_path / "sheet.html"
+    ran = mwdcal("plan", "--tool", cal, "--report", sheet)
+    said = "the calibration that {} names has temperature terms"
+    assert said.format("--tool") in sheet.read_text("utf-8")
+    library.plan(cal).report(sheet)
+    assert said.format("&#39;tool&#39;") in sheet.read_text("utf-8")
     assert "\nplanned at 25 °C; the calibration will be good for 20…30 °C\n" in ran.out
     assert ran.out.count("D-efficiency: how close the plan is to the best possible one") == 1
     assert "30.0…70.0 °C, and this plan gives none" in ran.err
@@ -257,7 +265,6 @@ def test_a_plan_says_its_temperatures_and_what_it_lacks_of_the_calibration(tmp_p
         "inclination_deg = [30, 90, 150]\nazimuth_deg = [0, 90]\ntoolface_deg = [0, 90, 180, 270]"
     )
     plan.write_text(f'name = "mine"\n{levels}\n[[stations]]\n{stations}\n', "utf-8")
-    sheet = tmp_path / "sheet.html"
     again = mwdcal("plan", "--tool", cal, "--plan", plan, "--order", 1, "--report", sheet)
     assert "\nplanned at 30, 50, 70 °C; the calibration will be good for 29…71 °C\n" in again.out
     page = sheet.read_text("utf-8")

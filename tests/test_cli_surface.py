@@ -664,6 +664,19 @@ def test_an_option_for_what_a_table_states_says_where_it_goes(option, line):
     assert ("Did you mean '--station'?" in done.err) != bool(line)
 
 
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [("calibrate run.csv --sheet X", "mwdcal profile TABLE --sheet … -o TOOL.toml"),
+     ("verify cal.json run.csv --msa", "It is an option of mwdcal survey."),
+     ("plan --replace", "mwdcal init, mwdcal profile, mwdcal certificate sign."),
+     ("survey cal.json run.csv --limit x", "Did you mean '--limits'?")],
+)  # fmt: skip
+def test_an_option_of_another_command_is_named_with_that_command(typed, said):
+    done = mwdcal(*typed.split())
+    assert done.code == 2
+    assert said in done.err
+
+
 def test_errors_name_options_as_they_are_typed():
     with pytest.raises(InputError) as refusal:
         failing.main(["run.csv"], standalone_mode=False)

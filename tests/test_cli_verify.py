@@ -442,6 +442,7 @@ def test_a_calibration_without_reference_inclinations_leaves_rotations_open(tmp_
     calibration = calibrated(tmp_path, run)
     opened = json.loads(calibration.read_bytes())["accelerometer"]["undetermined"]
     assert {"rotation-x", "rotation-y"} <= {entry["id"] for entry in opened}
+    assert "each with a name in the column 'group'" in opened[0]["text"]
     roll = simulated(ROLL, 8)
     said = mwdcal("verify", calibration, write_csv(tmp_path / "roll.csv", roll))
     assert said.code == 1

@@ -73,6 +73,11 @@ def test_letters_that_the_first_encoding_of_dos_has_are_read_as_its_successor(te
             ("Inclinación °", "Azimut magnético °", "Toolface °", "G{} g", "B{} mG", "Temp °C"),
         ),
         (
+            "cp949",
+            "전자기장 {field} nT, 복각 {dip}도, 중력 {gravity} m/s2",
+            ("경사각(도)", "방위각(도)", "툴페이스(도)", "가속도{}(V)", "자기{}(V)", "온도(°C)"),
+        ),
+        (
             "utf-16-le",
             "Field {field} nT, dip {dip}°, g {gravity} m/s²",
             ("Inc °", "Azi °", "TF °", "G{} (V)", "H{} (V)", "Temp °C"),

@@ -3,6 +3,7 @@
 import datetime
 import json
 import re
+from hashlib import sha256
 from pathlib import Path
 
 import msgspec
@@ -235,6 +236,13 @@ def test_a_calibration_may_be_its_file(calibrated, tmp_path):
             task(3, roll)
 
 
+def test_a_previous_calibration_is_named_by_its_digest(tmp_path):
+    path = tmp_path / "previous.json"
+    mwdcal.save(mwdcal.calibrate(mwdcal.simulate(tool=4, seed=1)), path)
+    again = mwdcal.calibrate(mwdcal.simulate(tool=4, seed=2), prior=mwdcal.load(path))
+    assert again.prior_sha256 == sha256(path.read_bytes()).hexdigest()
+
+
 def test_arrays_in_another_unit_are_refused_by_theirs(calibrated):
     """Raw readings, which the unit of the calibration's run would explain, are no arrays."""
     made, _, _ = calibrated
@@ -280,7 +288,8 @@ def test_a_column_that_is_no_number_is_text_and_refused_only_where_it_is_needed(
     assert read["Day"].tolist()[:2] == ["2026-01-31", ""]
     assert [read[n][1] for n in ("Clock", "Since", "Good")] == ["10:00:00", "0:00:01", "true"]
     (unused,) = mwdcal.calibrate({**table, **beside}, PROFILE).findings[:1]
-    assert unused.text == f"columns not used: {', '.join(map(repr, beside))}."
+    others = [name for name in beside if name not in ("Time", "Day")]  # these say the day
+    assert unused.text == f"columns not used: {', '.join(map(repr, others))}."
     for task in (mwdcal.apply, mwdcal.survey):
         assert np.isfinite(task(made, {**table, **beside}).columns["inclination_deg"]).all()
     with pytest.raises(mwdcal.InputError, match=r"row 1, column 'ax': expected a number; .*Write"):

@@ -285,6 +285,18 @@ def test_only_colours_change_in_the_dark(sheet):
         assert is_colour or name in ("filter", "mix-blend-mode", "color-scheme"), name
 
 
+def test_the_table_of_a_verification_fits_a_narrow_page(written, open_page):
+    seen = open_page(written("verify"))
+    seen.look(WIDTHS[1], "light")
+    wide = (
+        "e => [e, ...e.querySelectorAll('td, caption')].map((x) => x.getBoundingClientRect().right)"
+    )
+    rights = seen.page.eval_on_selector("#verdict", wide)
+    assert len(rights) > 10
+    assert max(rights) <= WIDTHS[1]
+    assert "noise-free" in seen.page.inner_text("#verdict caption")
+
+
 def test_a_page_says_the_same_without_its_script(written, open_page):
     plain = open_page(written("calibrate"), java_script_enabled=False)
     helped = open_page(written("calibrate"))

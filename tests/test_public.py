@@ -192,6 +192,31 @@ def test_unknown_references_are_left_out_and_blank_ones_stay_nan(simulated):
     assert np.isnan(made.known["inclination"]).sum() == 8
 
 
+@pytest.mark.parametrize(
+    ("metadata", "magnetic"),
+    [
+        ({"azimuth_reference": "magnetic", "declination_deg": 3.0}, 2.0),
+        ({"azimuth_reference": "true", "declination_deg": 3.0}, 359.0),
+        ({"azimuth_reference": "grid", "declination_deg": 3.0, "convergence_deg": 1.5}, 0.5),
+    ],
+)
+def test_metadata_of_arrays_say_what_those_of_a_file_do(simulated, tmp_path, metadata, magnetic):
+    stated = {**metadata, "ref_field_nt": 50000, "ref_dip_deg": 70.0, "ref_gravity_g": 1.001}
+    given = {"inclination_deg": 30.0, "azimuth_deg": 2.0, "toolface_deg": 10.0, "gravity": 0.999}
+    run = mwdcal.readings(simulated.accelerometer, simulated.magnetometer, metadata=stated, **given)
+    path = tmp_path / "run.csv"
+    mwdcal.save(run, path)
+    assert (
+        f"azimuth_reference = {metadata['azimuth_reference']!r}".replace("'", '"')
+        in path.read_text()
+    )
+    for each in (run, mwdcal.read_run(path)):
+        np.testing.assert_allclose(np.degrees(each.known["azimuth"]), magnetic, atol=1e-12)
+        np.testing.assert_allclose(np.degrees(each.known["dip"]), 70.0)
+        assert {*each.known["field"].tolist()} == {50000.0}
+        assert {*each.known["gravity"].tolist()} == {0.999}
+
+
 def test_uncertainties_by_name_and_unit(simulated):
     sd = {
         "accelerometer": 1e-4,

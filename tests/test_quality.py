@@ -700,6 +700,9 @@ def test_readings_that_scatter_too_little_name_the_noise_they_are_compared_with(
     result = verify(made, msgspec_replace(quiet, accelerometer=smooth), BOTH)
     (text,) = (each.text for each in result.findings if each.id == "little-scatter")
     assert STATE_STAND in text
-    assert "too large, or the tool moved, during the run of the calibration or as readbacks say" in text
+    assert (
+        "too large, or the tool moved, during the run of the calibration or as readbacks say"
+        in text
+    )
     assert f"less about the curves than the {word} noise explains" in text
     assert text.endswith(f"The 1σ comes from the {word} noise.")

@@ -104,6 +104,15 @@ def test_the_scatter_of_readbacks_has_its_degrees_of_freedom(calibrated):
         assert row.degrees_of_freedom == pytest.approx(18, abs=0.01)
 
 
+def test_readbacks_leave_a_stated_noise_stated(calibrated):
+    """The readings follow the readbacks, whose scatter counts as noise: they scatter less than both."""
+    quiet = [(replace(tool, noise=(1e-6, 1.0)), calibration) for tool, calibration in calibrated]
+    for verdict, _, _ in roll_tests(quiet, 2, 0.05):
+        (text,) = (each.text for each in verdict.findings if each.id == "little-scatter")
+        assert "the stated noise explains" in text
+        assert "estimated" not in text
+
+
 RUNS = 200
 STAND = {
     "true readbacks": (True, 0.0, {}, ""),

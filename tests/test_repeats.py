@@ -48,6 +48,54 @@ def read(run, tool=None):
     )
 
 
+@pytest.mark.parametrize(
+    ("off", "count"),
+    [
+        ([0.045, -0.05, 0.05, 0.01, -0.01], COUNT),
+        ([-0.08, -0.03, 0.03, 0.08, 0.04], COUNT * READINGS),
+    ],
+)
+def test_readbacks_of_one_setting_lie_about_their_middle(off, count):
+    """Two of them may differ by 0.1°; where a row after the other goes further, each is a station."""
+    run, _ = repeated()
+    for name in ANGLES:
+        run[name] = np.round(run[name] + np.tile(off, COUNT), 6)
+    assert read(run).count == count
+
+
+def test_a_profile_that_takes_means_says_so_where_only_the_angles_tell(tmp_path):
+    """A table with the names of a run file and without labels: calibrate and fleet do what profile says."""
+    run, _ = repeated()
+    folder, tool, cal = tmp_path / "runs", tmp_path / "t.toml", tmp_path / "c.json"
+    folder.mkdir()
+    path = write_csv(folder / "A1.csv", {n: v for n, v in run.items() if n != "station"})
+    proposed = mwdcal("profile", path, "-o", tool)
+    ran = mwdcal("calibrate", path, "--tool", tool, "-o", cal)
+    many = mwdcal("fleet", folder, "--tool", tool, "-o", tmp_path / "f.parquet", "--workers", 1)
+    for each in (proposed, ran, many):
+        assert each.code == 0, each.err
+        assert "24 stations of 5 readings each: their means are taken" in each.err
+    assert library.load(cal).stations == COUNT
+    assert library.load(f"{tmp_path / 'f.parquet'}#A1").stations == COUNT
+
+
+def test_a_fleet_in_parquet_takes_the_means_of_a_label_as_a_run_file_does(tmp_path):
+    arrow, pq = (pytest.importorskip(name) for name in ("pyarrow", "pyarrow.parquet"))
+    run, _ = repeated()
+    parts = {n: [*values, *values] for n, values in run.items()}
+    parts["serial"] = ["A1"] * COUNT * READINGS + ["A2"] * COUNT * READINGS
+    pq.write_table(arrow.table(parts), tmp_path / "runs.parquet")
+    fleet = library.fleet(tmp_path / "runs.parquet", workers=1)
+    said = " ".join(each.text for each in fleet.findings)
+    assert "48 stations of 5 readings each: their means are taken" in said
+    alone = library.calibrate(
+        write_csv(tmp_path / "a.csv", run), "generic", order=0, nonlinearity="none"
+    )
+    for serial in ("A1", "A2"):
+        assert fleet[serial].stations == COUNT
+        assert fleet[serial].parameters == pytest.approx(alone.parameters, rel=1e-9)
+
+
 def test_rows_of_one_label_and_setting_are_one_station_at_their_means(tmp_path):
     run, _ = repeated()
     path, tool, cal = tmp_path / "a.csv", tmp_path / "t.toml", tmp_path / "c.json"

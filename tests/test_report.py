@@ -471,7 +471,7 @@ def test_verdict_comes_first(whole, words):
     assert "1.230°" in failed  # two digits of the uncertainty…
     assert "0.040°" in failed  # …and that
     assert "1.450°" in failed
-    assert "0.040°</td><td>8</td>" in failed
+    assert '0.040°</td><td data-title="DoF">8</td>' in failed
     assert "Risk of a wrong verdict, all roll sets and limits together: 0.02." in failed
     assert "&lt;b&gt;" in failed
     assert "Not verified" not in failed

@@ -92,6 +92,43 @@ def test_a_run_of_two_days_whose_numbers_go_on_is_one(
     assert len(tables.every_table(path)) == count
 
 
+WARM = [f"{row},{t}" for row, t in zip(FIRST, [25] * 9, strict=True)]
+HOT = [f"{row},{t}" for row, t in zip(FIRST, [80] * 9, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("titles", "second", "count"),
+    [
+        (("Corrida 1", "Corrida 2 (se movió el sensor)"), WARM, 2),
+        (("1. Messung", "2. Messung"), WARM, 2), (("第1次", "第2次"), WARM, 2),
+        (("Первый замер", "Второй замер"), WARM, 2), (("Run A", "Run B"), WARM, 2),
+        (("Run 1", "Run 1 (continued)"), WARM, 1),
+        (("Run 1", "Run 2"), HOT, 1), (("Run 1, 25 °C", "Run 2, 80 °C"), WARM, 1),
+        (("Series 1", "Series 2"), [f"{row},25" for row in SECOND], 1),
+        (("Run 1", "Remark: see 2 below"), WARM, 1),
+    ],
+)  # fmt: skip
+def test_lines_that_number_runs_of_the_same_settings_part_them(
+    tmp_path: Path, titles: tuple[str, str], second: list[str], count: int
+) -> None:
+    """Soaks and series at other settings are one run, and so are stations that are numbered on."""
+    path, names = tmp_path / "runs.csv", f"{NAMES},Temp (C)"
+    one, two = titles
+    path.write_text("\n".join([*A, "", one, names, *WARM, "", two, names, *second]) + "\n")
+    assert len(tables.every_table(path)) == count
+    if count == 2:
+        with pytest.raises(QuestionError, match="2 tables of like columns"):
+            library.propose_profile(path)
+    for first, expected in ((10, 1), (1, count)):
+        rows = [
+            [f"{k},{row}" for k, row in enumerate(each, start)]
+            for each, start in ((WARM, 1), (second, first))
+        ]
+        lines = [*A, "", one, f"No,{names}", *rows[0], "", two, f"No,{names}", *rows[1]]
+        path.write_text("\n".join(lines) + "\n")
+        assert len(tables.every_table(path)) == expected
+
+
 def test_readings_of_another_table_state_no_reference(tmp_path: Path) -> None:
     """A strength of the channel Mz, with its unit in the name, is a reading."""
     path, names = tmp_path / "two.csv", NAMES.replace("Bz", "Mz raw (nT)")
@@ -287,3 +324,20 @@ def test_a_table_below_a_roll_test_is_one_too_unless_it_is_called_a_run(
     lines = [*A, "Roll test 45°", NAMES, *FIRST, "", title, NAMES, *SECOND]
     path.write_text("\n".join(lines) + "\n")
     assert [t.kind for t in tables.every_table(path)] == ["roll test", kind]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "xlsx"])
+def test_names_repeated_below_a_roll_test_are_not_joined_to_it_in_silence(
+    tmp_path: Path, suffix: str
+) -> None:
+    """Nothing calls the second table a run, nor are its rows numbered on: somebody must say what it is."""
+    rows = [["Roll test"], *FACTS, TITLES, *ROLLS, [], TITLES, *RUN]
+    path = tmp_path / f"two.{suffix}"
+    if suffix == "xlsx":
+        written(path, rows)
+    else:
+        path.write_text("\n".join(",".join(map(str, row)) for row in rows) + "\n")
+    asked = mwdcal("profile", path, "-o", tmp_path / "t.toml")
+    assert asked.code != 0
+    line = len(FACTS) + len(ROLLS) + 4
+    assert str(line) in asked.err

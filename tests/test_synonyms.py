@@ -14,8 +14,10 @@ from mwdcal.files.contract import COLUMNS
 from mwdcal.files.synonyms import (
     ABOVE,
     ANTICLOCKWISE,
+    ANTICLOCKWISE_FROM_LOW_SIDE,
     BELOW,
     CONVERSIONS,
+    FROM_LOW_SIDE,
     Resemblance,
     check_evidence,
     resembled,
@@ -91,7 +93,7 @@ def test_conversions_are_those_of_the_units():
         "ft/s²": (32.17404855643045, 1.0),  # the standard gravity, in feet of 0.3048 m
         "A/m": (79.577471545947667, 100_000.0),  # an oersted, a gauss in air
         "gon": (100.0, 90.0), ABOVE: (-90.0, 0.0), BELOW: (90.0, 0.0),
-        ANTICLOCKWISE: (90.0, -90.0),
+        ANTICLOCKWISE: (90.0, -90.0), FROM_LOW_SIDE: (270.0, 90.0), ANTICLOCKWISE_FROM_LOW_SIDE: (90.0, 90.0),
     }  # fmt: skip
     assert known.keys() == CONVERSIONS.keys()
     for unit, (given_as, wanted) in known.items():

@@ -164,6 +164,84 @@ def test_a_cover_sheet_states_serial_and_references(tmp_path):
     assert np.degrees(run.reference("dip")) == pytest.approx(np.full(run.count, 65.0))
 
 
+def test_two_serials_on_two_sheets_are_asked_about(tmp_path):
+    book, columns = openpyxl.Workbook(), table()
+    book.active.append(["Serial number", "AK-4471"])
+    sheet = book.create_sheet("Data")
+    for row in (["Tool SN: AK-4417"], [], [*columns], *zip(*columns.values(), strict=True)):
+        sheet.append([v.item() if hasattr(v, "item") else v for v in row])
+    path = tmp_path / "run.xlsx"
+    book.save(path)
+    with pytest.raises(FitError, match=r"'AK-4417' and 'AK-4471'.*serial='AK-4471'"):
+        library.propose_profile(path)
+    assert library.propose_profile(path, serial="AK-4471").profile.name == "AK-4471"
+    assert "'AK-4417' is taken unless" in " ".join(read(path, serial="AK-4471").remarks)
+    book["Sheet"]["B1"] = "SN ak 4417"
+    book.save(path)
+    assert not any("another sheet" in each for each in read(path).remarks)
+
+
+@pytest.mark.parametrize(
+    ("cells", "day"),
+    [
+        (["Fecha: 21 de mayo de 2024"], "2024-05-21"), (["Data", "12 de Junho de 2024"], "2024-06-12"),
+        (["Calibration date", "August 22, 2024"], "2024-08-22"), (["Dátum:", "2024. 02. 21."], "2024-02-21"),
+        (["дата 28.08.2023"], "2023-08-28"), (["Дата", "3 грудня 2023 р."], "2023-12-03"),
+        (["Logged 2024-08-22"], "2024-08-22"), (["교정일", "2024년 4월 2일"], "2024-04-02"),
+        (["Ngày", "28 tháng 11 năm 2023"], "2023-11-28"), (["Data: 5 marca 2024"], "2024-03-05"),
+        (["Tarih", "9 Şubat 2024"], "2024-02-09"), (["Date :", "1er août 2023"], "2023-08-01"),
+        (["Päivämäärä", "7. kesäkuuta 2024"], "2024-06-07"), (["Datum", "5. märz 2024"], "2024-03-05"),
+        (["Date", "31 June 2024"], None), (["Date", "12 temp 2024"], None), (["Set 2, 2024"], None),
+    ],
+)  # fmt: skip
+def test_a_day_with_its_month_in_words_of_other_languages(cells, day):
+    assert titles([cells]).metadata.get("date") == day
+
+
+@pytest.mark.parametrize(
+    ("cells", "serial"),
+    [
+        (["Ferramenta", "MWD-BR 0092"], "MWD-BR 0092"), (["Verktøy nr. BG 114"], "BG 114"),
+        (["Calibrare senzori, seria RO-58, Ploiești"], "RO-58"), (["Số máy (S/N)", "VT-0065"], "VT-0065"),
+        (["Gyári szám:", "HU-0238"], "HU-0238"), (["일련번호", "KR-D 014"], "KR-D 014"),
+        (["Заводський номер", "4471"], "4471"), (["Seria 2"], None), (["Stand (S/N)", "44"], None),
+        (["Tool May 2024"], None),
+    ],
+)  # fmt: skip
+def test_a_serial_behind_words_of_other_languages(cells, serial):
+    assert titles([cells]).metadata.get("serial") == serial
+
+
+@pytest.mark.parametrize("title", ["copy of 2022 - do not use", "kopia, nie używać", "veraltet"])
+def test_a_copy_of_the_channels_that_does_not_count_is_not_read(tmp_path, title):
+    columns = table()
+    names = [*columns]
+    copied = [NAMES[c] for c in ("ax", "ay", "az", "mx", "my", "mz")]
+    rows = [[*names, "", *copied]]
+    for k in range(48):
+        cells = [columns[name][k] for name in names]
+        rows.append([*cells, "", *(1.02 * columns[name][k] + 0.01 for name in copied)])
+    book = openpyxl.Workbook()
+    book.active.append([""] * (len(names) + 1) + [title])
+    for row in rows:
+        book.active.append([v.item() if hasattr(v, "item") else v or None for v in row])
+    book.save(tmp_path / "run.xlsx")
+    whole = read(written(tmp_path / "run.csv", columns)).accelerometer
+    assert read(tmp_path / "run.xlsx").accelerometer == pytest.approx(whole)
+    assert "are not read" in " ".join(read(tmp_path / "run.xlsx").remarks)
+
+
+def test_means_below_the_readings_of_a_station_are_no_readings_however_spelt(tmp_path):
+    rows = list[str]()
+    for k in range(4):
+        rows += [f"{30 * k},{90 * k},{n},0.{k},0.{n},0.9,{k}00{n},2{k}00,48000" for n in (1, 2, 3)]
+        rows.append(f"{30 * k},{90 * k},Avarage,0.{k},0.2,0.9,{k}002,2{k}00,48000")
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["Inc,Azi,Reading,Gx,Gy,Gz,Hx,Hy,Hz", *rows]) + "\n")
+    (only,) = tables.every_table(path)
+    assert only.texts[2] == ["1", "2", "3"] * 4
+
+
 NOMINAL = {
     "Nominal field;48 500 nT": "ref_field_nt",
     "Total field, approx.;48.5 µT": "ref_field_nt",

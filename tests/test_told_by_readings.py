@@ -1111,3 +1111,80 @@ def test_an_angle_out_of_range_is_not_called_exchanged_where_the_readings_deny_i
 )  # fmt: skip
 def test_the_serial_stands_behind_the_word_for_the_tool_in_indonesian_and_turkish(row, serial):
     assert titles([row]).metadata.get("serial") == serial
+
+
+LOW_SIDES = (
+    "Rullvinkel: 0 når merket peker NED (lavside)", "Toolface zero = low side", "TF 0 with the scribe down",
+    "Rollwinkel ab Tiefseite gezählt", "Toolface: cero con la marca hacia abajo", "Toolface: lado baixo = 0",
+    "Toolface 0: repère en bas", "Угол установки отклонителя: 0, когда метка внизу", "工具面角：从低边算起",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("line", LOW_SIDES)
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_toolface_that_counts_from_the_low_side_by_a_line(tmp_path, line, turned):
+    """A toolface at the low side is 180°, whichever way the angle counts."""
+    face = servo_run()["ref_toolface_deg"]
+    cells = (180 - face if turned else face + 180) % 360
+    above = [line, "Toolface counts anticlockwise"] if turned else [line]
+    path = written(tmp_path / "a.csv", table(ref_toolface_deg=cells), *above, delimiter=";")
+    assert np.cos(read(path).reference("toolface") - np.radians(face)) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Toolface 0 at high side, 180 at low side", "Roll 0 = ritslijn boven", "TF from high side",
+        "Low side of the stand repaired 2023", "Toolface 180 = mark down",
+    ],
+)  # fmt: skip
+def test_a_toolface_that_counts_from_the_high_side(tmp_path, line):
+    path = written(tmp_path / "a.csv", table(), line, delimiter=";")
+    turns = read(path).reference("toolface") - np.radians(servo_run()["ref_toolface_deg"])
+    assert np.cos(turns) == pytest.approx(1)
+
+
+def test_a_dutch_toolface_counts_anticlockwise_by_its_name():
+    assert meaning("rol linksom [gr]").unit == "° anticlockwise"
+
+
+@pytest.mark.parametrize(
+    "doubt", ["Azi (T/M?) (deg)", "Declination 1.2 W (applied to stand azimuth? - confirm)"]
+)
+def test_a_north_with_a_question_mark_is_asked_about(tmp_path, doubt):
+    columns, above = table(), []
+    if doubt.startswith("Azi"):
+        columns = {doubt if name == "Azi (deg)" else name: v for name, v in columns.items()}
+    else:
+        above = [doubt]
+    path = written(tmp_path / "a.csv", columns, *above)
+    with pytest.raises(FitError, match="which north .* counts from"):
+        library.propose_profile(path)
+    assert read(path, north="magnetic").count == 48
+
+
+@pytest.mark.parametrize("line", ["Azimut magn?tico", "Declination 1.2? E"])
+def test_a_question_mark_for_a_letter_that_was_lost_asks_nothing(tmp_path, line):
+    assert read(written(tmp_path / "a.csv", table(), line)).count == 48
+
+
+def test_a_dip_behind_a_field_is_no_second_field():
+    stated = stated_above([["Feldstärke / Inklination:", "48,61 µT / 64,6°"]])
+    assert stated.metadata == pytest.approx({"ref_field_nt": 48610.0, "ref_dip_deg": 64.6})
+    assert not stated.choices
+
+
+@pytest.mark.parametrize(
+    ("row", "dip"),
+    [
+        (["Câmp total 48420 nT, înclinarea câmpului 64,1°"], 64.1), (["Góc từ khuynh", "+2.4°"], 2.4),
+        (["복각(도)", 53.3], 53.3),
+    ],
+)  # fmt: skip
+def test_the_dip_in_romanian_vietnamese_and_korean(row, dip):
+    assert references_in([row])["ref_dip_deg"] == pytest.approx(dip)
+
+
+def test_a_russian_declination_in_degrees_by_its_name():
+    row = ["Магнитное склонение, град", "+15,3 (восточное)"]
+    assert titles([row]).metadata["declination_deg"] == 15.3

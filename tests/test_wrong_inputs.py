@@ -95,6 +95,40 @@ def changed(folder, name, **columns):
     return write_csv(folder / f"{name}.csv", table)
 
 
+def test_a_reference_in_a_thousandth_of_its_unit_is_remarked(tmp_path):
+    """As a workbook keeps µT below a heading in nT: the tool is sound, and its field is 50,000 nT."""
+    run = {n: c for n, c in servo_run().items() if n != "ref_field_nt"}
+    for stated, remarked in (("50.123", True), ("50123", False), ("50.123 uT", False)):
+        path = workbook(tmp_path / "run.xlsx", Cal=named(run))
+        book = openpyxl.load_workbook(path)
+        book["Cal"].insert_rows(1)
+        in_micro = stated.endswith("uT")
+        book["Cal"]["A1"] = "Magnetic field" if in_micro else "Magnetic field (nT)"
+        book["Cal"]["B1"] = stated if in_micro else float(stated)
+        book.save(path)
+        ran = mwdcal("profile", path, "-o", tmp_path / f"{remarked}{stated}.toml", "--json")
+        said = findings(ran)
+        assert ("reference-rescaled" in said) is remarked
+        if remarked:
+            assert "50.123" in said["reference-rescaled"]
+            assert "50123 nT" in said["reference-rescaled"]
+
+
+def test_a_text_among_readings_of_a_well_is_asked_about_with_what_to_do(laboratory, tmp_path):
+    well = {n: [*c] for n, c in read_csv(laboratory / "well.csv").items()}
+    well = {n.replace("Accel", "Accelerometer"): c for n, c in well.items()}
+    cal, output = laboratory / "cal.json", ("-o", tmp_path / "o.csv")
+    well["Accelerometer Y (V)"][5] = "spike"
+    message = refused(mwdcal("survey", cal, write_csv(tmp_path / "w.csv", well), *output), 2, 3)
+    assert "got 'spike'" in message
+    assert "Or empty it: --missing blank then leaves the results of its row blank." in message
+    well["Accelerometer Y (V)"][5] = ""
+    table = write_csv(tmp_path / "w.csv", well)
+    ran = mwdcal("survey", cal, table, *output, "--missing", "blank", "--json")
+    assert ran.code == 0, ran
+    assert "1 of 24 rows lack a reading" in ran.err
+
+
 # ------------------------------------------------------------------------------- a channel is missing
 
 
@@ -245,6 +279,22 @@ def test_stations_of_several_directions_are_no_roll_test(laboratory, inclination
     assert "60." in message
 
 
+def test_a_well_is_no_roll_test_whatever_its_temperatures_and_a_part_of_a_turn_neither(laboratory):
+    """In each soak the inclination changes by little; over the well it goes from 20 to 60°."""
+    well = measured((20, 24, 28, 52, 56, 60), 8)
+    warmth = np.repeat([20.0, 30.0], 24)
+    part = {n: c[:12] for n, c in rolled().items()}
+    for name, table, said in (
+        ("well", {**well, "temperature_c": warmth}, "several directions"),
+        ("part", part, "the toolfaces leave a gap of 195°"),
+    ):
+        table = {n: c for n, c in table.items() if not n.startswith("ref_")}
+        file = write_csv(laboratory / f"{name}-of-a-turn.csv", named(table))
+        message = refused(mwdcal("verify", laboratory / "cal.json", file), 2)
+        assert "is no roll test, in which the tool is rolled all round" in message
+        assert said in message
+
+
 def test_vectors_of_a_rolled_tool_lie_in_a_plane_whatever_one_reading_says():
     """Scales, biases and exchanged axes keep them there; a single wrong reading is not the set's."""
     roll = rolled()
@@ -298,6 +348,9 @@ def test_the_only_other_sheet_like_that_of_the_run_is_its_roll_test(tmp_path):
     ran = mwdcal(*both)
     assert ran.code == 2, ran
     assert "--rolltest-sheet A or --rolltest-sheet B" in ran.err
+    assert "If it is not among them, name another file." in ran.err
+    said = mwdcal("profile", more, "--sheet", "Cal", "-o", tmp_path / "more.toml").err
+    assert "with --rolltest b.xlsx --rolltest-sheet A." in said
     assert mwdcal(*both, "--rolltest-sheet", "A").code == 0
 
 

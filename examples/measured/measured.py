@@ -280,7 +280,7 @@ class Sap:
 
 
 def sap(name: str) -> Sap:
-    """One SAP instrument from its two roll groups and spread shots alone, no reference at all."""
+    """One SAP instrument from its two roll sets and spread shots alone, no reference at all."""
     return Sap(name, *SAP[name], *scatters(name, "magnetometer"))
 
 

@@ -963,7 +963,7 @@ has them:
 |---|---|---|
 | imucal | six faces on a table | yes, see below |
 | mikov, xsens | hand-held positions, attitude unknown | no: nothing but \|g\| is known |
-| sap5, sap6, distox | shots and roll groups of unknown direction | no: no reference angle |
+| sap5, sap6, distox | shots and roll sets of unknown direction | no: no reference angle |
 
 So no measured set says which method gives the better angles, and attitudes taken from another calibration
 of the same data would decide nothing.

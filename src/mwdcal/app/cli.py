@@ -8,14 +8,15 @@ import io
 import os
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import chain
 
 import click
 
 from mwdcal import __version__
 from mwdcal.app import interruption
 from mwdcal.app.commands import Commands
-from mwdcal.app.messages import say, screens
+from mwdcal.app.messages import OPTION_GROUPS, say, screens
 from mwdcal.errors import MwdcalError, reason
 from mwdcal.presentation.text import escape_controls, laid_out, without_passwords
 
@@ -78,6 +79,8 @@ ALIASES = {
     "fit": "mwdcal calibrate",
 }
 """Commands by other names that people type for them."""
+_MOST_COMMANDS = 3
+"""Commands that a message names."""
 _LONG = re.compile(r"([^'\n]{300})[^'\n]+")
 """A value that a message about a wrong option repeats, where it is too long to be read."""
 
@@ -173,6 +176,32 @@ def _nearest(word: str, names: Iterable[str]) -> str:
     return next(iter(get_close_matches(word, [*names], n=1)), "")
 
 
+def _named(option: str, command: click.Command) -> click.Parameter | None:
+    """The option of a command that has a name."""
+    return next((each for each in command.params if option in each.opts), None)
+
+
+def _commands_with(option: str, group: click.Group, words: str) -> Iterator[str]:
+    """The commands of a group that have an option, each as it is typed."""
+    for name in group.commands:
+        command = group.commands[name]
+        if isinstance(command, click.Group):
+            yield from _commands_with(option, command, f"{words} {name}")
+        elif _named(option, command):
+            yield f"{words} {name}"
+
+
+def _option_of_others(option: str, command: click.Command) -> str:
+    """Which commands have an option that one has not; or that a profile says it, by which that one reads."""
+    of_profile = _named(option, cli.commands["profile"])
+    says = of_profile and of_profile.name not in (*chain(*OPTION_GROUPS.values()), "replace")
+    if says and _named("--tool", command):
+        return f" The tool profile says it: mwdcal profile TABLE {option} … -o TOOL.toml"
+    others = [*_commands_with(option, cli, "mwdcal")]
+    named = ", ".join(others[:_MOST_COMMANDS]) + " and others" * (len(others) > _MOST_COMMANDS)
+    return f" It is an option of {named}." if others else ""
+
+
 def _with_nearest(error: click.ClickException) -> click.ClickException:
     """The same error; of a wrong option with the one that is nearest, of a second file with its option."""
     if isinstance(error, click.NoSuchOption):
@@ -183,6 +212,10 @@ def _with_nearest(error: click.ClickException) -> click.ClickException:
                 f"{error.message} {place}: mwdcal reference gives it.", error.ctx
             )
         nearest = _nearest(error.option_name, error.possibilities or [])
+        if error.ctx and not nearest.startswith(error.option_name):
+            others = _option_of_others(error.option_name, error.ctx.command)
+            if others:
+                return click.UsageError(f"{error.message}{others}", error.ctx)
         return click.NoSuchOption(error.option_name, None, [nearest] if nearest else [], error.ctx)
     context = error.ctx if isinstance(error, click.UsageError) else None
     extra = _EXTRA.fullmatch(error.message)

@@ -21,7 +21,7 @@ from mwdcal.calibration.readings import TRIADS
 from mwdcal.errors import InputError
 from mwdcal.files.formats.columns import LABELS
 from mwdcal.files.formats.table import LEAVE_OUT, Table, cell_error, numbers, shown
-from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, CONVERSIONS, resembled
+from mwdcal.files.synonyms import ABOVE, BELOW, CONVERSIONS, OF_TOOLFACES, resembled
 from mwdcal.geometry.vectors import AnyArray, Array, Bools, Ints
 from mwdcal.sensor.profile import Profile
 
@@ -148,7 +148,7 @@ def units_of(column: str) -> tuple[str, ...]:
     if column == "ref_inclination_deg":
         return (*_UNITS_BY_END[end], ABOVE, BELOW)
     if column == "ref_toolface_deg":
-        return (*_UNITS_BY_END[end], ANTICLOCKWISE)
+        return (*_UNITS_BY_END[end], *OF_TOOLFACES)
     return _UNITS_BY_END.get(end, ()) if column.removeprefix("sd_") not in (*RAW, *LABELS) else ()
 
 

@@ -11,7 +11,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, TypeVar, get_args, get_origin
 
 import msgspec
 
@@ -179,9 +179,21 @@ def decoded_toml(
         compared = (
             f"Compare it with the built-in ones: {names} (docs" if names else "Correct it (docs"
         )
-        raise InputError(
-            f"{name} is not a {kind}: {toml_problem(error)}. {compared}, '{page}')."
-        ) from None
+        problem = f"{toml_problem(error)}. {_section_line(str(error), struct)}"
+        raise InputError(f"{name} is not a {kind}: {problem}{compared}, '{page}').") from None
+
+
+def _section_line(problem: str, struct: type[msgspec.Struct]) -> str:
+    """The sentence on the line that belongs above an unknown key, where a section of the `struct` has it."""
+    unknown = re.match(r"Object contains unknown field `(.*)`$", problem)
+    for section in msgspec.structs.fields(struct) if unknown else ():
+        kinds = (section.type, *get_args(section.type))
+        keys = [key for each in kinds for key in getattr(each, "__struct_fields__", ())]
+        if unknown and unknown[1] in keys:
+            title = section.encode_name
+            line = f"[[{title}]]" if get_origin(section.type) is list else f"[{title}]"
+            return f"'{unknown[1]}' belongs below a line {line}. "
+    return ""
 
 
 def _decoded(data: bytes, struct: type[_Decoded]) -> _Decoded:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mwdcal.calibration.readings import ONE_SETTING, SOAK_GAP
+from mwdcal.calibration.readings import EQUAL, ONE_SETTING, SOAK_GAP
 from mwdcal.estimation.problem import ANGLES
 from mwdcal.files import synonyms
 from mwdcal.files.contract import CHANNELS, MAPPED, RAW, REFERENCES, is_angle
@@ -121,7 +121,7 @@ def repeats(table: Table, sources: Mapping[str, ColumnSource]) -> Repeats | None
     labelled = bool(alike.any())
     numbered = len({*station.tolist()}) == table.count
     if labelled:
-        same &= alike & ~_set_anew(angles)
+        same = _at_one_setting(angles, same & alike)
     elif {"inclination", "toolface"} <= {*angles} and (numbered or not station.any()):
         same &= np.all([_equal(each) for each in angles.values()], 0)
     else:
@@ -184,11 +184,21 @@ def _equal(values: np.ndarray) -> Bools:
     return np.asarray(values[1:] == values[:-1])
 
 
-def _set_anew(angles: Mapping[str, Array]) -> Bools:
-    """Whether an angle of a row but the first is another than before; a blank one is not."""
-    turned = [np.abs(centred(np.diff(each), circle.WHOLE_TURN)) for each in angles.values()]
-    limit = np.degrees(ONE_SETTING)
-    return np.any([each > limit for each in turned], 0) if turned else np.array(False)
+def _at_one_setting(angles: Mapping[str, Array], same: Bools) -> Bools:
+    """Whether (n - 1,) rows that go with the one before are at its setting; a blank angle is that of the others.
+
+    All angles of a setting lie within `ONE_SETTING` of their middle; where rows go further, each is a setting.
+    """
+    most, around = np.degrees(2 * ONE_SETTING + EQUAL), circle.WHOLE_TURN
+    for each in angles.values():
+        same = same & ~(np.abs(centred(np.diff(each), around)) > most)
+    starts = _starts(same)
+    sizes = np.diff(starts, append=len(same) + 1)
+    for each in angles.values():
+        away = centred(each - np.repeat(each[starts], sizes), around)
+        span = np.fmax.reduceat(away, starts) - np.fmin.reduceat(away, starts)
+        same = same & ~np.repeat(span > most, sizes)[1:]
+    return same
 
 
 def _starts(same: Bools) -> Ints:

@@ -417,8 +417,16 @@ def station_table(table: Table, profile: Profile) -> Table:
         return table
     if sets.numbered or not (sources or sets.labelled):
         return replace(table, remarks=(*table.remarks, sets.advice()))
+    _check_cells(renamed(table, profile), profile)
     scales = {kind: getattr(profile, kind).scale for kind in CHANNELS}
     return replace(means(table, sources, sets), remarks=(*table.remarks, sets.sentence(scales)))
+
+
+def _check_cells(table: Table, profile: Profile) -> None:
+    """Refuse the first cell that a run may not have, by its row; rows of one tool that follow each other are a run."""
+    tools = np.array(labels(table, "serial") or [""] * table.count)
+    starts = np.r_[0, 1 + np.flatnonzero(tools[1:] != tools[:-1]), table.count]
+    refuse(table, faults(columns_of(table), starts, profile))
 
 
 def _check_names(table: Table, sources: Mapping[str, ColumnSource]) -> None:
@@ -550,17 +558,32 @@ def _with_angles(columns: dict[str, Column]) -> dict[str, Column]:
 def _with_stated_references(table: Table) -> Table:
     """The table with the references that its metadata state for all stations, where it has no column of them."""
     columns = dict(table.columns)
+    blank = [
+        each.column
+        for each in REFERENCES.values()
+        if each.column in columns and is_blank(table, each.column)
+    ]
+    stated = stated_references(table.metadata, columns.keys() - blank, table.source)
+    columns |= {column: np.full(table.count, value) for column, value in stated.items()}
+    return replace(table, columns=columns)
+
+
+def stated_references(
+    metadata: Mapping[str, object], given: Collection[str], source: str
+) -> dict[str, float]:
+    """The references that metadata state for all stations, by the names of their columns, without those `given`."""
+    values: dict[str, float] = {}
     for column in (REFERENCES[name].column for name in STATED_REFERENCES):
-        value = table.metadata.get(column)
-        if value is None or (column in columns and not is_blank(table, column)):
+        value = metadata.get(column)
+        if value is None or column in given:
             continue
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise InputError(
-                f"{table.source}, metadata '{column}': must be a number; got {shown(str(value))}. Write it with a "
+                f"{source}, metadata '{column}': must be a number; got {shown(str(value))}. Write it with a "
                 "decimal point and without quotes."
             )
-        columns[column] = np.full(table.count, float(value))
-    return replace(table, columns=columns)
+        values[column] = float(value)
+    return values
 
 
 def check_run(table: Table) -> None:
@@ -681,11 +704,16 @@ def _azimuth_offset(table: Table) -> float:
 
 def _north(table: Table) -> dict[str, object]:
     """The north that the azimuths of a table count from, as metadata state it; empty where it is magnetic."""
-    stated = {**table.north, **table.metadata}
     azimuths = REFERENCES["azimuth"].column in table.columns
-    if not azimuths or stated.get(AZIMUTH_KEYS[0], "magnetic") == "magnetic":
+    return north_of({**table.north, **table.metadata}) if azimuths else {}
+
+
+def north_of(metadata: Mapping[str, object]) -> dict[str, object]:
+    """The north that azimuths count from, as metadata state it; empty where it is magnetic."""
+    if metadata.get(AZIMUTH_KEYS[0], "magnetic") == "magnetic":
         return {}
-    return {k: "true" if stated[k] is True else stated[k] for k in AZIMUTH_KEYS if k in stated}
+    stated = {key: metadata[key] for key in AZIMUTH_KEYS if key in metadata}
+    return {key: "true" if value is True else value for key, value in stated.items()}
 
 
 def convert(

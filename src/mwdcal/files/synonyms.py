@@ -49,7 +49,9 @@ _SPELLINGS = {
 _UNITS = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
 """Units by the words of names, as `_words` leaves them."""
 ABOVE, BELOW, ANTICLOCKWISE = "° above horizontal", "° below horizontal", "° anticlockwise"
+FROM_LOW_SIDE, ANTICLOCKWISE_FROM_LOW_SIDE = "° from low side", "° anticlockwise from low side"
 """Units of angles that count otherwise: an elevation upwards or downwards from the horizontal, a toolface."""
+OF_TOOLFACES = (ANTICLOCKWISE, FROM_LOW_SIDE, ANTICLOCKWISE_FROM_LOW_SIDE)
 CONVERSIONS = {
     "°F": "°C = (°F - 32) · 5/9",
     "K": "°C = K - 273.15",
@@ -68,6 +70,8 @@ CONVERSIONS = {
     ABOVE: f"° = {ABOVE} + 90",
     BELOW: f"° = 90 - {BELOW}",
     ANTICLOCKWISE: f"° = -{ANTICLOCKWISE}",
+    FROM_LOW_SIDE: f"° = {FROM_LOW_SIDE} - 180",
+    ANTICLOCKWISE_FROM_LOW_SIDE: f"° = 180 - {ANTICLOCKWISE_FROM_LOW_SIDE}",
 }
 """How another unit is converted into that of the contract."""
 FACTORS = {
@@ -88,6 +92,8 @@ FACTORS = {
     ABOVE: (1.0, 90.0),
     BELOW: (-1.0, 90.0),
     ANTICLOCKWISE: (-1.0, 0.0),
+    FROM_LOW_SIDE: (1.0, -180.0),
+    ANTICLOCKWISE_FROM_LOW_SIDE: (-1.0, 180.0),
 }
 """The same in numbers: factor, and what is added to the product."""
 _WARM = ("°C", "°F", "K")

@@ -39,6 +39,7 @@ from mwdcal.sensor.profile import Profile
 SERIAL = "serial"
 RUN_FILE = "#file"
 """Column of the path of the run file that a row comes from."""
+_LABEL = "station"
 FAULT = "#fault"
 """Column of what is wrong with a run file that cannot be read: it has one row."""
 
@@ -204,7 +205,7 @@ def open_source(
     Run files are read by the `profile`.
     """
     paths, others = input_files(path)
-    mixed = any(file.suffix.lower() != PARQUET for file in paths)
+    mixed = any(file.suffix.lower() != PARQUET or _has_repeats(file) for file in paths)
     files = []
     for count, file in enumerate(paths, 1):
         files.append(_described(file, path, profile) if mixed else _look(file, path))
@@ -297,7 +298,7 @@ def input_files(path: Path) -> tuple[list[Path], list[Path]]:
 
 def _described(file: Path, root: Path, profile: Profile) -> _File:
     """One file of a folder with run files; what is wrong with it is data."""
-    if file.suffix.lower() != PARQUET:
+    if file.suffix.lower() != PARQUET or _has_repeats(file):
         return _look_at_runs(file, root, profile)
     try:
         table = _look(file, root)
@@ -307,6 +308,25 @@ def _described(file: Path, root: Path, profile: Profile) -> _File:
     except InputError as error:
         return _refused(file, file.stem, error)
     return table
+
+
+def _has_repeats(file: Path) -> bool:
+    """Whether rows of a Parquet file that follow each other have one tool and label: it is read as a run file is."""
+    arrow, pq = parquet.modules(str(file))
+    import pyarrow.compute as compute
+
+    with parquet.reading(str(file)), pq.ParquetFile(file) as opened:
+        names = {*opened.schema_arrow.names}
+        if not {_LABEL, "ax"} <= names or opened.metadata.num_rows > runs.MOST_ROWS:
+            return False
+        columns = opened.read([_LABEL, *{SERIAL} & names]).combine_chunks()
+    same = True
+    for column in columns.columns:
+        cells = column.cast(cell_type(column.type))
+        same = compute.and_(same, compute.equal(cells[1:], cells[:-1]))
+        if arrow.types.is_string(cells.type) or arrow.types.is_large_string(cells.type):
+            same = compute.and_(same, compute.not_equal(cells[1:], ""))
+    return compute.any(same).as_py() is True
 
 
 def _look_at_runs(file: Path, root: Path, profile: Profile) -> _File:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mwdcal.calibration.record import Finding
+from mwdcal.errors import shell_word
 from mwdcal.files import runs
 from mwdcal.files.contract import RAW
 from mwdcal.files.formats.columns import shown
@@ -71,11 +72,12 @@ def _sentence(table: Layout, is_test: bool, sheet: str, file: str) -> str:
     line = f"below line {table.form.header_line}"
     place = f"on sheet {shown(table.sheet)}" if table.sheet != sheet else line
     what = f"{table.kind or 'other readings'} {place}, {len(table.lines)} rows"
+    option = f"`rolltest` {shell_word(file)}"
     if is_test:
-        return f"{what}: mwdcal calibrate judges by it where `rolltest` is {file} too."
+        return f"{what}: mwdcal calibrate judges by it with {option}."
     if table.kind and table.kind != ROLL_TEST:
         return f"{what}: not read."
     if table.sheet == sheet:
         return f"{what}: not read. If it is the roll test, write it to a file of its own."
-    named = f"{file} by `rolltest`, and {shown(table.sheet)} by `rolltest_sheet`"
-    return f"{what}: not read. If it is the roll test, name {named}."
+    option += f" `rolltest_sheet` {shell_word(table.sheet)}"
+    return f"{what}: not read. If it is the roll test, mwdcal calibrate takes it with {option}."

@@ -25,13 +25,15 @@ from mwdcal.files.contract import (
 from mwdcal.files.formats.columns import LABELS, shown
 from mwdcal.files.formats.layout import OF_CHECKS, OF_ROLLS
 from mwdcal.files.formats.title_references import EARTH_FIELD
-from mwdcal.files.formats.titles import titles
+from mwdcal.files.formats.titles import titles, unread_declination
 from mwdcal.files.profiles import setting
 from mwdcal.files.synonyms import (
     ABOVE,
     ANTICLOCKWISE,
+    ANTICLOCKWISE_FROM_LOW_SIDE,
     BELOW,
     FACTORS,
+    FROM_LOW_SIDE,
     OF_TIME,
     WARMTH,
     Resemblance,
@@ -322,8 +324,9 @@ def _sphere(centred: Array) -> tuple[Array, Array]:
 
 
 def in_units(name: str, column: str, allowed: Sequence[str]) -> list[Answer]:
-    """Each of the units as the answer to the one that a column is in."""
-    return [Answer(unit, (("column", f"{column}={name} ({unit})"),)) for unit in allowed]
+    """Each of the units as the answer to the one that a column is in; no reading tells a low side from a high side."""
+    others = [unit for unit in allowed if unit not in (FROM_LOW_SIDE, ANTICLOCKWISE_FROM_LOW_SIDE)]
+    return [Answer(unit, (("column", f"{column}={name} ({unit})"),)) for unit in others]
 
 
 def lacking_references(present: Collection[str]) -> list[str]:
@@ -473,6 +476,12 @@ _OTHER_NORTH = re.compile(
 _GRID_NORTH = re.compile(r"grid|gitter|[qc]uadr[ií]cula|kartnord|сетк|坐标北|网格", re.IGNORECASE)
 _OF_NORTH = re.compile(r"north|nord|norte|azi|azm|heading|азим|север|北|方位", re.IGNORECASE)
 """Words of the north that azimuths count from."""
+_CALLED_NORTH = re.compile(
+    r"(?<![^\W\d_])([tmg]|true|mag\w*|grid|geogr\w*|wahr|ист\w*|магн\w*)(?![^\W\d_])|[真磁]",
+    re.IGNORECASE,
+)
+_IN_DOUBT = re.compile(r"[^\W\d_]\s*[)\]]?\s*[?？](?![^\W\d_])")
+"""A question mark behind a word; behind a number, alone or within a word it is a letter that was lost."""
 _TWICE = re.compile(r" \(\d+\)$")
 """The end of a name that stands in a table more than once."""
 _LONE_AXIS = re.compile(r"(?<![^\W_])([xyzXYZ])(?![^\W_])")
@@ -523,10 +532,29 @@ _CCW = re.compile(
     r"против (хода )?час\w*( стрелк\w*)?|mot(urs| ?(klok|urvis)\w*)|anti-? ?hor[aá]ri[oa]s?|anti-? ?horaires?|"
     r"antiorari\w*|trigonom[ée]tri(que|co)|inverse des aiguilles( d'une montre)?|tegen de klok( in)?|"
     r"contrari\w+ a(l reloj| las (agujas|manecillas)( del reloj)?)|contr[aá]rio ao(s ponteiros)?( do)? rel[oó]gio|"
-    r"przeciwn\w* do (ruchu )?wskaz[oó]wek( zegara)?)|逆时针(方向)?|反時計(回り|方向)?",
+    r"przeciwn\w* do (ruchu )?wskaz[oó]wek( zegara)?|linksom\b|linksherum\b|linksdrehend\w*|"
+    r"lev[oó]gir[oa]s?|sinistrors[oia]|venstredreid\w*)|逆时针(方向)?|反時計(回り|方向)?",
     re.IGNORECASE,
 )
 """Words of angles that count anticlockwise."""
+_OF_TOOLFACE = re.compile(r"toolface|\broll?\b|\broll|\btf\b|angle de rotation", re.IGNORECASE)
+_ZERO = r"(?:(?<![\d.,])0(?:[.,]0+)?\s*(?:°|deg\w*|gra[du]\w*)?(?![\d.,]*\d)|zero|null(?:punkt)?|cero|ноль|нуль|零)"
+_LOW_SIDE = (
+    r"(?:low[- ]?side|lavside\w*|l[aå]gside\w*|tiefseite|unterseite|lage zijde|onderzijde|"
+    r"lado (?:de )?(?:abajo|bajo|baixo)|c[oô]t[eé] bas|lato (?:basso|inferiore)|"
+    r"нижн\w+ сторон\w+|нижн\w+ стенк\w+|doln\w+ stron\w+|低边|下侧|"
+    r"(?:scribe|mark(?:e|er|ierung)?|key(?:way)?|notch|slot|kerbe|nut|merket?|riss|marca|ranura|rasgo|rep[eè]re|encoche|"
+    r"tacca|ritslijn|merkteken|znak|ryska|риск\w*|метк\w*|标记|刻线|键槽)(?: line)?[^\d,;.]{0,20}?"
+    r"(?<![^\W\d_])(?:down(?:wards?)?|at (?:the )?bottom|unten|ned(?:over)?|nere?|nedåt|onder|beneden|(?:hacia )?abajo|"
+    r"(?:para )?baixo|(?:vers le|en) bas|in basso|w dół|na dole|вниз\w*|снизу)(?![^\W\d_])|(?:标记|刻线|键槽)[朝向]?下)"
+)
+_FROM_LOW = re.compile(
+    rf"(?:{_ZERO}|(?<![^\W\d_])(?:from|von|ab|desde|a partir d[eo]|fra|från|depuis|vanaf|dal?|от|od)(?![^\W\d_])|从|自)"
+    rf"(?:[^\d,;.]|,(?=\s*(?:wenn|когда|если|коли|da|gdy)\b)){{0,30}}?{_LOW_SIDE}|"
+    rf"{_LOW_SIDE}\s*[)\]]?\s*(?:[=:：]|is|at|bei|ist|ved|en|is op|为)\s*{_ZERO}",
+    re.IGNORECASE,
+)
+"""Words of toolfaces that count from the low side, or that are zero where the mark of the tool is down."""
 _UPHOLE = re.compile(
     r"look\w* up|up ?hole|from (the )?(below|bottom)|von unten|nedenfra|desde abajo|visto de baixo|d'en bas|du bas|"
     r"z dołu|od dołu|снизу|向上看|从下",
@@ -784,12 +812,28 @@ def meanings_of(
     dips = [n for n in inclined if re.search("inklination", n, re.IGNORECASE)]
     if len(dips) == 1 and any(re.search("neigung", n, re.IGNORECASE) for n in inclined):
         results[dips[0]] = results[dips[0]]._replace(column="ref_dip_deg")
-    if any(map(_says_anticlockwise, above)):
-        results |= {
-            n: m._replace(unit=ANTICLOCKWISE)
-            for n, m in results.items()
-            if m.column == REFERENCES["toolface"].column and unit_of(m.unit) in ("", "°")
-        }
+    return results | _toolfaces_by_words(results, above)
+
+
+def _toolfaces_by_words(
+    meanings: Mapping[str, Resemblance], above: Sequence[str]
+) -> dict[str, Resemblance]:
+    """The toolfaces that a line, or their name, says to count anticlockwise or from the low side."""
+    results = {}
+    for name, each in meanings.items():
+        if each.column == REFERENCES["toolface"].column and unit_of(each.unit) in (
+            "",
+            "°",
+            ANTICLOCKWISE,
+        ):
+            turned = each.unit == ANTICLOCKWISE or any(map(_says_anticlockwise, above))
+            low = _FROM_LOW.search(name) or any(map(_says_from_low_side, above))
+            unit = (
+                (ANTICLOCKWISE if turned else each.unit)
+                if not low
+                else (ANTICLOCKWISE_FROM_LOW_SIDE if turned else FROM_LOW_SIDE)
+            )
+            results[name] = each._replace(unit=unit)
     return results
 
 
@@ -886,8 +930,17 @@ def _by_axes(
 def _says_anticlockwise(line: str) -> bool:
     """Whether a line says that toolfaces count anticlockwise, looking down the hole."""
     text = spelled(line)
-    of_toolface = re.search(r"toolface|\broll|\btf\b|angle de rotation", text, re.IGNORECASE)
-    return bool(of_toolface and _CCW.search(text)) and not _UPHOLE.search(text)
+    return bool(_OF_TOOLFACE.search(text) and _CCW.search(text)) and not _UPHOLE.search(text)
+
+
+def _says_from_low_side(line: str) -> bool:
+    """Whether a line says that toolfaces count from the low side.
+
+    >>> lines = "Toolface 0 = mark down", "TF 0 at high side, 180 at low side", "Rollwinkel ab Tiefseite"
+    >>> [_says_from_low_side(line) for line in lines]
+    [True, False, True]
+    """
+    return bool(_OF_TOOLFACE.search(spelled(line)) and _FROM_LOW.search(line))
 
 
 _TOOL_AXIS = re.compile(
@@ -1879,7 +1932,13 @@ def _is_but(words: re.Pattern[str], name: str, column: str) -> bool:
 
 
 def _check_north(name: str, above: Sequence[str], source: str) -> None:
-    """Refuse azimuths that by their name, or by a line above the table, count from true or grid north."""
+    """Refuse azimuths that by their name, or by a line above the table, count from true or grid north, or may do so."""
+    if doubt := _doubt_of_north(name, above):
+        raise QuestionError(
+            f"{source}: {'its name' if doubt == name else f'the line {shown(doubt)}'} leaves open which north "
+            f"{shown(name)} counts from. Which is it, and what is the declination, degrees east?",
+            answers_of_north(),
+        )
     line = next(
         (each for each in above if _OTHER_NORTH.search(each) and _OF_NORTH.search(each)), ""
     )
@@ -1894,6 +1953,18 @@ def _check_north(name: str, above: Sequence[str], source: str) -> None:
     )
 
 
+def _doubt_of_north(name: str, above: Sequence[str]) -> str:
+    """The name of azimuths, or a line on north or declination, that ends a word in a question mark; else empty.
+
+    >>> _doubt_of_north("AZI (T/M?)", ()), _doubt_of_north("Azi (?)", ["Declination 1.2? W"])
+    ('AZI (T/M?)', '')
+    """
+    if _IN_DOUBT.search(name) and _CALLED_NORTH.search(name):
+        return name
+    norths = (a for a in above if _OF_NORTH.search(a) or unread_declination(a))
+    return next((a for a in norths if _IN_DOUBT.search(a)), "")
+
+
 def answers_of_north(grid: bool = False) -> list[Answer]:
     """The norths that azimuths may count from, where it is not magnetic by its name or the readings; `grid` first."""
     norths = [
@@ -1906,6 +1977,8 @@ def answers_of_north(grid: bool = False) -> list[Answer]:
 
 def north_of(name: str, above: Sequence[str], stated: Mapping[str, object]) -> str:
     """The north that azimuths count from where their name or a line says it, and all that it takes is stated."""
+    if _doubt_of_north(name, above):
+        return ""
     line = next((a for a in above if _OTHER_NORTH.search(a) and _OF_NORTH.search(a)), "")
     text = f"{line} {name} {spelled(name)}"
     if not _OTHER_NORTH.search(text):

@@ -550,6 +550,7 @@ def _proposal(
     table, form, columns, by_value, ignored = named_columns(table, form, where, answers)
     if filled := _with_angles_filled(name, where, (table, whole), columns, form, stated, answers):
         return filled
+    _check_serials(where, {*columns, *stated}, table.source)
     _check_choices(where, {*columns, *table.metadata, *answers}, table.source)
     check_cells(table, columns)
     blank = _blank_references(table, columns)
@@ -576,8 +577,10 @@ def _proposal(
     if sets:
         scales = {kind: triad.scale for kind, triad in triads.items()}
         remarks.append(sets.advice() if sets.numbered else sets.sentence(scales))
+    if not sets or sets.labelled:  # a run file's rows without labels are stations each
+        profile = _without_the_usual(profile)
     return Proposal(
-        _without_the_usual(profile), wirings, readings.count, readings.unused, tuple(remarks), by_value,
+        profile, wirings, readings.count, readings.unused, tuple(remarks), by_value,
         readings.metadata, readings.run_sha256, where, open_axes, ignored, source=table.source,
         all_fit=_all_fit(readings, wirings), level=_level(readings), said=said,
         others=tuple(n for n in table.columns if n not in {*OURS, *ignored, *(c.name for c in columns.values())}),
@@ -590,6 +593,17 @@ def _level(readings: Readings) -> tuple[float, float] | None:
     if np.isnan(known).any() or np.ptp(np.cos(known)) >= MOTION_RANGE[0]:
         return None
     return float(np.degrees(known.min())), float(np.degrees(known.max()))
+
+
+def _check_serials(where: Layout | None, known: Collection[str], source: str) -> None:
+    """Ask which serial is that of the tool where sheets of a file state different ones."""
+    serials = where.titles.choices.get("serial", ()) if where and "serial" not in known else ()
+    if serials:
+        every = [str(serial) for serial in serials]
+        raise QuestionError(
+            f"{source}: its sheets state the serials {' and '.join(map(shown, every))}. Which one is that of the tool?",
+            [Answer(serial, (("serial", serial),)) for serial in every],
+        )
 
 
 def _check_choices(where: Layout | None, known: Collection[str], source: str) -> None:
@@ -606,7 +620,9 @@ def _check_choices(where: Layout | None, known: Collection[str], source: str) ->
             ],
         )
         for column, values in choices.items()
-        if column not in known and (magnetic or column == REFERENCES["gravity"].column)
+        if column in _OF_THE_PLACE
+        and column not in known
+        and (magnetic or column == REFERENCES["gravity"].column)
     ]
     if questions:
         raise QuestionsError(source, questions)
@@ -1807,6 +1823,24 @@ def lines_not_taken(proposal: Proposal) -> list[Finding]:
     )
 
 
+def read_as_thousands(proposal: Proposal) -> list[Finding]:
+    """A finding on each reference whose decimal sign in the table is read as one of thousands: 50.612 nT."""
+    sign = "," if proposal.profile.form.decimal == "," else "."
+    number = re.compile(rf"(?<![\d.,])(\d{{1,3}})\{sign}(\d{{3}})(?![\d.,])")
+    lines = proposal.where.above if proposal.where else ()
+    return [
+        Finding(
+            id="reference-rescaled",
+            text=f"{column}: {match[0]} of the line {shown(line)} is taken as {value:.8g} {RANGES[column].unit}. "
+            "Correct the number or its unit in the table.",
+        )
+        for column, value in stated_references(proposal).items()
+        for line in lines
+        for match in number.finditer(line)
+        if references_in([[line.replace(match[0], match[1] + match[2])]]).get(column) == value
+    ]
+
+
 def answers_by_readings(proposal: Proposal) -> list[Finding]:
     """A finding on what the names of a table leave open and the readings answer."""
     return [
@@ -1916,6 +1950,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         + left_handed({kind: each.axes for kind, each in proposal.wirings.items()})
         + turned_about_z(proposal)
         + lines_not_taken(proposal)
+        + read_as_thousands(proposal)
         + marked
     )
     if proposal.profile.columns is not msgspec.UNSET and RAW[3] not in proposal.profile.columns:

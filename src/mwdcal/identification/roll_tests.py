@@ -205,19 +205,17 @@ def read_roll_test(
             return _under_names_of_run(path, where, profile, said)
         return _by_meaning(path, where, profile, said)
     except (QuestionError, QuestionsError) as error:
-        raise_answerable(error)
+        raise_answerable(error, "Correct the cell, or take the row out of the table.")
 
 
-def raise_answerable(error: QuestionError | QuestionsError) -> NoReturn:
-    """Raise questions with the answers that a later table takes."""
+def raise_answerable(error: QuestionError | QuestionsError, remedy: str) -> NoReturn:
+    """Raise questions with the answers that a later table takes; the `remedy` where rows are to be left out."""
     every = error.questions if isinstance(error, QuestionsError) else (error,)
-    questions = [
-        QuestionError(
-            each.text,
-            [a for a in each.answers if all(name in _ANSWERED for name, _ in a.arguments)],
-        )
-        for each in every
-    ]
+    questions = []
+    for each in every:
+        taken = [a for a in each.answers if all(name in _ANSWERED for name, _ in a.arguments)]
+        rows = any(name == "leave_out" for a in each.answers for name, _ in a.arguments)
+        questions.append(QuestionError(f"{each.text} {remedy}" if rows else each.text, taken))
     raise (
         QuestionsError(error.source, questions)
         if isinstance(error, QuestionsError)
@@ -245,7 +243,9 @@ def one_of(meant: Sequence[Layout], question: str) -> Layout | None:
     if len({t.sheet for t in meant}) > 1:
         places = ", ".join(f"sheet {shown(t.sheet)} ({len(t.lines)} rows)" for t in meant)
         answers = [Answer(shown(t.sheet), (("sheet", t.sheet),)) for t in meant]
-        raise QuestionError(f"{question}: {places}?", answers)
+        raise QuestionError(
+            f"{question}: {places}? If it is not among them, name another file.", answers
+        )
     return max(meant, key=lambda t: t.size, default=None)
 
 

@@ -41,6 +41,10 @@ from mwdcal.sensor.profile import ColumnSource, Profile, TableFormat
 
 _TAKEN = (*RAW, WARMTH, "station", "serial")
 """Columns that surveys take by the meaning of their names: angles and totals may be the tool's own."""
+_LEFT_BLANK = (
+    "Correct the cell. Or empty it: `missing` blank then leaves the results of its row blank."
+)
+"""The remedy for a row with a cell that is no reading."""
 
 
 def table_of_other_names(
@@ -67,7 +71,7 @@ def table_of_other_names(
         assert table is not None
         return _by_meaning(table, form, where, calibration, said)
     except (QuestionError, QuestionsError) as error:
-        raise_answerable(error)
+        raise_answerable(error, _LEFT_BLANK)
 
 
 def _table_in(

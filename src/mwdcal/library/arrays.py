@@ -12,7 +12,15 @@ from mwdcal.calibration.readings import TRIADS, Readings, fingerprints, group_nu
 from mwdcal.errors import InputError
 from mwdcal.estimation.problem import ANGLES, WALKS
 from mwdcal.files import metadata as meta
-from mwdcal.files.contract import RAW_SPREAD, REFERENCES, TEMPERATURE, Range
+from mwdcal.files.contract import (
+    RAW_SPREAD,
+    REFERENCES,
+    TEMPERATURE,
+    Range,
+    is_angle,
+    magnetic_offset,
+)
+from mwdcal.files.runs import north_of, stated_references
 from mwdcal.geometry.vectors import Array, ArrayLike, Bools, wrap
 from mwdcal.sensor.profile import COMMON, PRACTICES
 
@@ -20,6 +28,8 @@ DEGREES_SUFFIX = "_deg"
 """Ending of the keyword twins that take degrees."""
 TURNING = ("azimuth", "toolface")
 """Angles that come as -360…360° and are kept as 0…360°."""
+_NAME = "the readings"
+"""Arrays in a message, where a file has its name."""
 
 
 class References(TypedDict, total=False):
@@ -58,7 +68,8 @@ def readings(
     NaN, None and what a mask hides are missing.
 
     Units: nominal g and nT along the tool axes (raw over the `scale` of the profile), °C, radians;
-    `inclination_deg`, `azimuth_deg`, `toolface_deg` and `dip_deg` take degrees instead. Azimuths are magnetic.
+    `inclination_deg`, `azimuth_deg`, `toolface_deg` and `dip_deg` take degrees instead. Azimuths are magnetic unless
+    `metadata` state another north, as in a run file: the readings then hold magnetic ones.
 
     Args:
         accelerometer: gravity, positive along an axis that points down.
@@ -77,7 +88,9 @@ def readings(
             equal inclination and azimuth ("per-direction"), or at every station ("per-station").
             Blank: not stated, once is assumed.
         station: labels, for messages and tables.
-        metadata: `serial` as text, `date` as 2026-01-31, `operator`, …; `simulated` marks data of no real tool.
+        metadata: `serial` as text, `date` as 2026-01-31, `operator`, …; `simulated` marks data of no real tool. Those
+            that a run file takes for its numbers count here too: `azimuth_reference` with `declination_deg` and
+            `convergence_deg`, and `ref_gravity_g`, `ref_field_nt` and `ref_dip_deg` of all stations.
         md_m: measured depths, m, which `survey` needs for a well path.
         references: `inclination`, `azimuth`, `toolface`, `gravity`, `field` and `dip`, where known.
 
@@ -86,6 +99,7 @@ def readings(
             reading; the message says which station. A serial that is a number with a point, or a `date` that is
             not an ISO date.
     """
+    stated = meta.plain(metadata or {}, _NAME)
     g = _vectors("accelerometer", accelerometer)
     b = None if magnetometer is None else _vectors("magnetometer", magnetometer)
     if b is not None and b.shape != g.shape:
@@ -98,18 +112,20 @@ def readings(
             f"`settings` must be {' or '.join(PRACTICES)}; got {settings!r}. Leave it out where it is not known."
         )
     shape, triads = g.shape[:-1], [g] if b is None else [g, b]
+    known = _as_stated(_known(references, shape), stated, shape)
     return Readings(
         accelerometer=g,
         magnetometer=b,
         temperature=None if temperature is None else _temperature(temperature, shape),
-        known=_known(references, shape),
+        known=known,
         sd=_uncertainties(sd or {}, shape),
         in_radians=tuple(name for name in ANGLES if name in (sd or {})),
         group=None if group is None else group_numbers(_labels("group", group, shape)),
         settings=settings,
         station=() if station is None else tuple(_labels("station", station, shape)),
         digest=fingerprints(triads) if len(shape) == 1 else (),
-        metadata=meta.plain(metadata or {}, "the readings"),
+        metadata=stated,
+        north=north_of(stated) if "azimuth" in known else {},
         others={} if md_m is None else {"md_m": _broadcast("md_m", md_m, shape)},
     )
 
@@ -230,6 +246,18 @@ def _known(references: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, A
         if not np.isnan(values).all():
             known[name] = values
     return known
+
+
+def _as_stated(
+    known: dict[str, Array], metadata: Mapping[str, object], shape: tuple[int, ...]
+) -> dict[str, Array]:
+    """References (..., n) as of a file with these metadata: magnetic azimuths, and values for all stations."""
+    once = stated_references(metadata, [REFERENCES[name].column for name in known], _NAME)
+    names = {each.column: name for name, each in REFERENCES.items()}
+    values = {names[c] + DEGREES_SUFFIX * is_angle(c): value for c, value in once.items()}
+    if "azimuth" in known and (offset := magnetic_offset(metadata, _NAME)):
+        known["azimuth"] = wrap(known["azimuth"] - np.radians(offset), 2 * np.pi)
+    return known | _known(values, shape)
 
 
 def _uncertainties(sd: Mapping[str, ArrayLike], shape: tuple[int, ...]) -> dict[str, Array]:

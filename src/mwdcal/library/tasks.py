@@ -199,6 +199,8 @@ def calibrate(
         InputError: an option is unknown.
     """
     options = with_choices(options, choices)
+    if options and isinstance(options.prior, Calibration) and not options.prior_sha256:
+        options = replace(options, prior_sha256=digest_of(options.prior))
     run, stated = _run_with_profile(run, profile, options)
     whole = run if profile is None else replace(run, profile_sha256="")
     return fit_and_judge(whole, stated, options)

@@ -53,7 +53,7 @@ def assumed_noise(profile: Profile) -> list[Finding]:
     ]
     text = (
         f"the profile '{profile.name}' does not state the noise of the {' and '.join(kinds)}; assumed is that of a "
-        f"servo instrument, {' and '.join(sizes)}. A calibration of the tool as `tool` brings the tool's own."
+        f"servo instrument, {' and '.join(sizes)}. Name a calibration of the tool by `tool`: it brings the tool's own."
     )
     return [Finding(id="noise-assumed", text=text)] if kinds else []
 
@@ -65,8 +65,8 @@ def temperature_terms_lost(tool: Calibration, planned: Calibration) -> list[Find
     low, high = tool.temperature_c
     levels = np.linspace(low, high, max(triad.order for triad in tool.triads) + 2)
     text = (
-        f"the calibration as `tool` has temperature terms, {low:.1f}…{high:.1f} °C, and this plan gives none. A plan "
-        f"file with temperature_c = [{', '.join(f'{each:.0f}' for each in levels)}], as `plan`, gives them "
+        f"the calibration that `tool` names has temperature terms, {low:.1f}…{high:.1f} °C, and this plan gives none. "
+        f"To get them, name a plan file with temperature_c = [{', '.join(f'{each:.0f}' for each in levels)}] by `plan` "
         "(docs, 'Planning')."
     )
     return [Finding(id="temperature-terms-lost", text=text)]
@@ -80,8 +80,8 @@ def drift_unforeseen(tool: Calibration) -> list[Finding]:
         if each.declared is msgspec.UNSET
     ]
     text = (
-        f"the run of the calibration as `tool` seems to have drifted: {', '.join(sizes)}. A plan does not foresee it: "
-        "a run that drifts as much will be less accurate than planned."
+        f"the run of the calibration that `tool` names seems to have drifted: {', '.join(sizes)}. A plan does not "
+        "foresee it: a run that drifts as much will be less accurate than planned."
     )
     return [Finding(id="drift-unforeseen", text=text)] if sizes else []
 

@@ -51,7 +51,7 @@ from mwdcal.presentation.numbers import (
 )
 from mwdcal.presentation.page import banner, environment
 from mwdcal.presentation.text import plural, raised
-from mwdcal.presentation.typed import findings_with_option_names, leading_findings
+from mwdcal.presentation.typed import leading_findings
 from mwdcal.presentation.verification import (
     BETWEEN_SETS,
     after_failure,
@@ -301,7 +301,7 @@ def _findings(calibration: Calibration, verdict: Verdict | None) -> list[Finding
     for extra in verdict.findings if verdict else ():
         if extra.id not in ids:
             findings.setdefault(extra.text, extra)
-    return findings_with_option_names(findings.values())
+    return [*findings.values()]
 
 
 def _when(time: str) -> str:

@@ -29,6 +29,7 @@ from mwdcal.presentation.numbers import (
     unit,
 )
 from mwdcal.presentation.text import chance, escape_controls, plural, raised
+from mwdcal.presentation.typed import on_page
 from mwdcal.use.plots import POINT_NAMES, style
 
 if TYPE_CHECKING:
@@ -222,7 +223,7 @@ def environment() -> Environment:
         loader=loader,
         autoescape=True,
         undefined=StrictUndefined,
-        finalize=lambda shown: escape_controls(shown) if type(shown) is str else shown,
+        finalize=lambda shown: escape_controls(on_page(shown)) if type(shown) is str else shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )

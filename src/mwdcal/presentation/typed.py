@@ -33,14 +33,24 @@ def with_option_names(text: str) -> str:
     """A message of the library with the options of the command that runs instead of its arguments.
 
     The library names an argument in backticks, also in the files that it writes; the name stays as
-    it is where no option has it.
+    it is where no option has it. A message that names another command names its options too.
     """
     context = click.get_current_context(silent=True)
-    parameters = context.command.params if context else []
-    typed = [p for p in parameters if isinstance(p, click.Option)]
+    if context is None or "`" not in text:
+        return text
+    commands = [context.command]
+    root, other = context.find_root().command, re.search(r"\bmwdcal (\w+)", text)
+    if isinstance(root, click.Group) and other and other[1] in root.commands:
+        commands.insert(0, root.commands[other[1]])
+    typed = [p for command in commands for p in command.params if isinstance(p, click.Option)]
     options = {p.opts[-1].lstrip("-").replace("-", "_"): p.opts[-1] for p in typed}
     options |= {p.name: p.opts[-1] for p in typed if p.name}
     return re.sub(r"`(\w+)`", lambda name: options.get(name[1], name[0]), text)
+
+
+def on_page(text: str) -> str:
+    """A message on a page: with option names, and other names in quotes."""
+    return re.sub(r"`(\w+)`", r"'\1'", with_option_names(text)) if "`" in text else text
 
 
 def findings_with_option_names(findings: Iterable[Finding]) -> list[Finding]:

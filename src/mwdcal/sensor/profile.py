@@ -149,6 +149,7 @@ class TableFormat(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         "cp1251",
         "gb18030",
         "cp932",
+        "cp949",
         "cp1250",
         "cp1254",
         "cp850",

@@ -967,8 +967,8 @@ class RollTest:
         first, reference = int(roll_set.index[0]), rolled.reference
         judged = figure(part, curve, noise, error, drawn(curve, name, first))
         most, least, farthest = np.degrees(ends(curve))
-        at = f" {farthest:.0f}°" if error else f"s {least:.0f}° to {most:.0f}°"
-        where = f"{roll_set.label}; curve at toolface{at}"
+        spread = f"least at toolface {least:.0f}°, most at {most:.0f}°"
+        where = f"{roll_set.label}; {f'largest at toolface {farthest:.0f}°' if error else spread}"
         if curve.rough(noise.known):
             left = float(f"{curve.scale:.2g}")
             where += f"; {RAW_JUDGED}: the readings leave a smooth curve by {left:g} × their noise"

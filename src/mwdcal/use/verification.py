@@ -279,7 +279,7 @@ CANNOT_BE_PASSED = "cannot be passed: "
 class VerdictRow(msgspec.Struct, frozen=True, kw_only=True):
     """One limit: the noise-free value, its standard uncertainty, and the decision.
 
-    `value` is that of the worst set or station; of several, less what choosing the largest adds.
+    `value` is that of the worst set or station; of several the largest, less what noise adds to it.
     `degrees_of_freedom` of `uncertainty`: None, unlimited, as the noise is declared; absent in documents of
     earlier versions. `probability_within`: that the true value is within the limit.
 
@@ -330,7 +330,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     `degrees_of_freedom`: of the triad of the calibration with the fewest. None: a document of an earlier version.
     `risk`: probability that the verdict is wrong, all sets and limits together: that a true value is beyond
     its limit in a pass, that none is in a fail. None: a limit was not or cannot be judged, or readings are not smooth.
-    `not_judged`: names of limits for which the run lacks something; absent in documents of earlier versions.
+    `not_judged`: names of limits without a row, as the run lacks something; absent in documents of earlier versions.
     `settings`: how often the stand's direction was set, "per-direction", "per-station", or "assumed" to be once
     per direction; empty where nobody stated it and nothing rests on it.
     """
@@ -439,7 +439,9 @@ def verify(calibration: Calibration, readings: Readings, limits: Limits) -> Verd
             *_findings(test, skipped),
             *_contradicted(test, limits),
             *_differing(test),
-            *_remarks(judged, STATE_STAND * (STAND_ANGLES_EXACT in calibration.assumed_exact)),
+            *_remarks(
+                test, judged, STATE_STAND * (STAND_ANGLES_EXACT in calibration.assumed_exact)
+            ),
             *chain(*(j.findings for j in judged)),
         ],
         station_rows=_station_rows(test, rows, [outcome[-1] for outcome in outcomes]),
@@ -463,11 +465,12 @@ class _Judged:
     errors: Array | None = None
 
 
-def _remarks(judged: Sequence[_Judged], stand: str) -> Iterator[Finding]:
+def _remarks(test: RollTest, judged: Sequence[_Judged], stand: str) -> Iterator[Finding]:
     """Findings that several limits share, each once; `stand`: of a calibration that took its angles as exact."""
     for name in dict.fromkeys(chain(*(each.remarks for each in judged))):
         rows = [each.row for each in judged if name in each.remarks]
-        noise = dict.fromkeys("stated" if row.freedom is None else "estimated" for row in rows)
+        freedom = (test.noise_freedom(row.name.rpartition(" of ")[2]) for row in rows)
+        noise = dict.fromkeys("estimated" if np.isfinite(each) else "stated" for each in freedom)
         title, whose = ", ".join(row.name for row in rows), " or ".join(noise)
         yield _finding(name, title=title, noise=whose, chance=DEPARTURE_CHANCE, stand=stand)
 
@@ -637,17 +640,25 @@ def _check_temperature(calibration: Calibration, readings: Readings) -> None:
 
 
 def _check_rolled(test: RollTest) -> None:
-    """Refuse stations of a run that names no direction, where they are of several."""
-    readings = test.readings
-    named = (readings.groups >= 0).any() or np.isfinite(readings.reference("inclination")).any()
-    most = np.sin(NO_ERROR_OF_A_TOOL["inclination"])
-    if named or not any(test.off_plane(s.index) > most for s in test.sets):
+    """Refuse a run that names no direction, where its stations are of several or no set of them is rolled."""
+    readings, everything = test.readings, np.arange(test.readings.count)
+    if (readings.groups >= 0).any() or np.isfinite(readings.reference("inclination")).any():
         return
-    angles = np.degrees(test.value("inclination"))
+    gaps = [test.loose(each.index) for each in test.sets]
+    if test.off_plane(everything) > np.sin(NO_ERROR_OF_A_TOOL["inclination"]):
+        angles = np.degrees(test.value("inclination"))
+        why = (
+            f"its stations, at inclinations from {angles.min():.1f}° to {angles.max():.1f}°, are of several "
+            "directions. Name another table, or give ref_inclination_deg and ref_azimuth_deg, or a group for each "
+            "direction"
+        )
+    elif gaps and all(gaps):
+        why = f"{gaps[0]}, or name another table"
+    else:
+        return
     raise InputError(
-        f"{readings.name} is no roll test, in which the tool is rolled about an axis that stands still: its stations, "
-        f"at inclinations from {angles.min():.1f}° to {angles.max():.1f}°, are of several directions. Name another "
-        "table, or give ref_inclination_deg and ref_azimuth_deg, or a group for each direction."
+        f"{readings.name} is no roll test, in which the tool is rolled all round about an axis that stands still: "
+        f"{why}."
     )
 
 

@@ -139,9 +139,9 @@ FREE_DIRECTIONS = {
     "toolface-zero": "toolface zero is undetermined: no evidence fixes rotation about the tool axis; kept at nominal. "
     "Give ref_toolface_deg at some stations to determine it",
     "rotation-x": "rotation about the tool's x axis is undetermined: no evidence fixes it; kept at nominal. Give "
-    "reference inclinations, or roll sets at three or more directions",
+    "reference inclinations, or roll sets at three or more directions, each with a name in the column 'group'",
     "rotation-y": "rotation about the tool's y axis is undetermined: no evidence fixes it; kept at nominal. Give "
-    "reference inclinations, or roll sets at three or more directions",
+    "reference inclinations, or roll sets at three or more directions, each with a name in the column 'group'",
     "scale": "overall scale is undetermined: no evidence fixes it; kept at nominal. Give a reference "
     "strength: ref_gravity_g or ref_field_nt",
 }

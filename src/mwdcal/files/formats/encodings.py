@@ -6,7 +6,7 @@ import re
 
 _ENCODINGS = (
     *("cp1252", "cp1250", "cp1254", "cp850", "mac-roman"),
-    *("cp1251", "cp866", "koi8-r", "iso8859-5", "gb18030", "cp932"),
+    *("cp1251", "cp866", "koi8-r", "iso8859-5", "gb18030", "cp932", "cp949"),
 )
 """Encodings without a mark; of two in which a text holds as much, the first is meant."""
 _FIELD_WORDS = re.compile(
@@ -16,6 +16,7 @@ _FIELD_WORDS = re.compile(
     r"角|温度|磁|加速度|日期|日付|序|编号|番号|工具|センサ|ツール|方位|井斜|傾斜|重力|标定|校正|仪器|機器|測定|"
     r"kąt|narzędz|świadec|całkow|przyśp|ciąż|położ|ferdeség|térerő|nehézségi|hőmérs|jegyző|gyorsulás|mágnes|"
     r"szerszám|úhel|zrychlení|měř|číslo|înclin|câmp|"
+    r"방위|경사|가속도|온도|자기|번호|중력|센서|교정|복각|툴페이스|"
     r"eğim|sıra|sıcaklık|takım|açıklama|ivme|yüzü|yönelim|ölçüm|yerçekimi",
     re.IGNORECASE,
 )

@@ -28,6 +28,7 @@ from mwdcal.files.formats.columns import (
     looks_numeric,
     plain_headings,
     shown,
+    without_marks,
 )
 from mwdcal.files.formats.settings import (
     angles_among,
@@ -63,8 +64,8 @@ _MOST_DIFFERENT = 2
 _SHARED = 0.6
 """Share of columns that two tables have in common if each may be meant."""
 _SUMMARY = re.compile(
-    r"\W*(mean|average|avg|median|std\w*|st\.?\s?dev\w*|standard deviation|rms|min(imum)?|max(imum)?|sum|total|range|"
-    r"span|mittel(wert)?|mw|durchschnitt|stabw\w*|standardabw\w*\.?|summe|snitt|gjennomsnitt|standardavvik|media|"
+    r"\W*(mean|av[ae]r[ae]ge|avg|median|std\w*|st\.?\s?dev\w*|standard deviation|rms|min(imum)?|max(imum)?|sum|total|"
+    r"range|span|mittel(wert)?|mw|durchschnitt|stabw\w*|standardabw\w*\.?|summe|snitt|gjennomsnitt|standardavvik|media|"
     r"promedio|desv\w*( est\w*)?|m[eé]d(ia|\.)|prom\.|moy\.|gj\.? ?snitt|ср\.?|desvio( padr[aã]o)?|"
     r"moyenne|[eé]cart[- ]type|среднее|ско|мин|макс|сумма|"
     r"平均(值)?|均值|标准差|最大值?|最小值?|合计|spread|σ|µ)\W*",
@@ -161,6 +162,23 @@ _CALLED_RUN = re.compile(
     r"(?<![^\W\d_])([ck]al|[ck]alib\w*|run|tumbl\w*|калибр\w*)(?![^\W\d_])|标定|校准", re.IGNORECASE
 )
 """Words of the title of a calibration run."""
+_WORD_OF_RUN = (
+    r"(?:runs?|series?|sets?|pass|trial|repeat|corridas?|pruebas?|ensay?i?os?|serien?|messreihe|messung|lauf|durchgang|"
+    r"essais?|s[eé]rie|mesure|passe|m[aå]ling|m[aä]tning|ajo|meting|pomiar|seria|misura|prova|medi(?:da|[cç][aã]o|ci[oó]n)|"
+    r"rodada|m[eě][rř]en[ií]|m[eé]r[eé]s|m[aă]sur[aă]toare|[oö]l[cç][uü]m|seri|pengukuran|l[aầ]n(?: đo)?|"
+    r"сери[яи]|замер|прогон|измерение|вимірювання)"
+)
+_ORDINAL = (
+    r"(?:\d{1,2}|[ivx]{1,4}|[ab]|first|second|third|erster?|zweiter?|dritter?|primer[ao]?|primeir[ao]|segund[ao]|"
+    r"premi[eè]re?|deuxi[eè]me|f[oø]rste|andre|перв\w+|втор\w+)"
+)
+_NUMBER_OF_RUN = re.compile(
+    rf"\W*(?:{_WORD_OF_RUN}\W*(?:(?:no|nr|n[°º]|№)\W*)?(?P<behind>{_ORDINAL})(?![\w.,/-]*\d)(?![^\W\d_])|"
+    rf"(?P<before>{_ORDINAL})(?:st|nd|rd|th|-?[йяе]|[.ªº°])*\s*{_WORD_OF_RUN}(?![^\W\d_])|"
+    r"第?\s*(?P<cjk>\d{1,2}|[一二三])\s*(?:次|回|组|차))",
+    re.IGNORECASE,
+)
+"""The beginning of a line that numbers a run: Run 2, 2. Messung, 第2次."""
 ROLL_TEST = "roll test"
 """The kind of such a table."""
 _OF_SETTING = re.compile(
@@ -678,7 +696,26 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
     """A table with what sheets without readings say, where its own title block does not."""
     words = " ".join([*layout.above, *(_text(row) for each in covers for _, row in each.rows[:1])])
     blocks = [stated_above([row for _, row in sheet.rows], (), words) for sheet in covers]
-    return replace(layout, titles=_completed(layout.titles, blocks))
+    ours = str(layout.titles.metadata.get("serial", ""))
+    theirs = {str(each.metadata["serial"]): None for each in blocks if "serial" in each.metadata}
+    others = [each for each in theirs if ours and not _is_same_serial(each, ours)]
+    titles_of_all = _completed(layout.titles, blocks)
+    if not others:
+        return replace(layout, titles=titles_of_all)
+    said = (
+        f"the table states the serial {shown(ours)}, another sheet {shown(others[0])}: {shown(ours)} is taken unless "
+        "`serial` says otherwise."
+    )
+    choices = {**titles_of_all.choices, "serial": (ours, *others)}
+    return replace(
+        layout, titles=titles_of_all._replace(choices=choices), remarks=(*layout.remarks, said)
+    )
+
+
+def _is_same_serial(one: str, other: str) -> bool:
+    """Whether two serials are one, but for signs, capitals and text around it."""
+    bare = [re.sub(r"[\W_]", "", each.casefold()) for each in (one, other)]
+    return bare[0] in bare[1] or bare[1] in bare[0]
 
 
 def _completed(block: Titles, others: Iterable[Titles]) -> Titles:
@@ -1135,9 +1172,9 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
     between = [
         " ".join(map(as_text, row)) for _, row in rows[heads[-1] : place] if not _is_reading(row)
     ]
-    if (_is_below_check(rows[: heads[-1]]) and between[1:]) or any(
-        ADJUSTED.search(text) or OF_CHECKS.search(text) for text in between[1:]
-    ):
+    if _is_below_check(rows[: heads[-1]]) and (between[1:] or not _go_on(rows, place)):
+        return True
+    if any(ADJUSTED.search(text) or OF_CHECKS.search(text) for text in between[1:]):
         return True
     first = _triads_in(" ".join(_text(row) for _, row in rows[max(0, heads[-1] - 1) : heads[-1]]))
     if first and _triads_in(" ".join(between[1:])) - first:
@@ -1149,7 +1186,50 @@ def _begins_anew(rows: Sequence[tuple[int, Cells]], heads: Sequence[int], place:
         return True
     stated = [_tools_in(rows[start:end]) for start, end in pairwise([0, *heads])]
     ours = next(filter(None, stated[::-1]), set())
-    return bool(_tools_in(block) - ours)
+    return bool(_tools_in(block) - ours) or _is_next_run(rows, heads[-1], place)
+
+
+def _is_next_run(rows: Sequence[tuple[int, Cells]], before: int, place: int) -> bool:
+    """Whether the lines above two heads number runs, the second of which repeats settings of the first.
+
+    Series of a thermal run, at another temperature by their columns or titles, and stations numbered on are one run.
+    """
+    titles_of = [_numbered_run(rows[:head]) for head in (before, place)]
+    numbers = [match and next(filter(None, match.groups())).casefold() for match in titles_of]
+    if None in numbers or numbers[0] == numbers[1] or _go_on(rows, place):
+        return False
+    if any(match and warmth_in(match.string) for match in titles_of):
+        return False
+    heads = (map(as_text, row) for _, row in rows[max(0, before - 2) : before + 1])
+    names = max(map(list, heads), key=lambda each: len(angles_among(each)))
+    ours, theirs = rows[before + 1 : place], rows[place + 1 :]
+    both = [
+        [row for _, row in ours if _is_reading(row)],
+        [*takewhile(_is_reading, (row for _, row in theirs))],
+    ]
+    warm = [k for k, name in enumerate(names) if _WARMTH_IN_WORDS.search(name)]
+    if any(
+        abs(b - a) > _SAME_WARMTH for a, b in zip(*(_means_of(r, warm) for r in both), strict=True)
+    ):
+        return False
+    angles = [k for k, name in enumerate(names) if angles_among([name])]
+    first, second = (
+        [[as_text(row[k]) for k in angles if k < len(row)] for row in each] for each in both
+    )
+    return 2 * sum(each in first for each in second) > len(second)
+
+
+def _numbered_run(above: Sequence[tuple[int, Cells]]) -> re.Match[str] | None:
+    """The last line above a head, below other readings, that numbers a run."""
+    lines = takewhile(lambda row: not _is_reading(row[1]), reversed(above))
+    return next(filter(None, (_NUMBER_OF_RUN.match(_line(row)) for _, row in lines)), None)
+
+
+def _means_of(rows: Sequence[Cells], places: Iterable[int]) -> list[float]:
+    """The means of the numbers of columns; 0 of none."""
+    columns = ([_number(row[k]) for row in rows if k < len(row)] for k in places)
+    numbers = [[n for n in column if n is not None] for column in columns]
+    return [float(np.mean(each)) if each else 0.0 for each in numbers]
 
 
 def _is_below_check(rows: Sequence[tuple[int, Cells]]) -> bool:
@@ -1322,17 +1402,15 @@ def _table(sheet: Sheet, span: _Span, source: str, decimal: str) -> Layout | Non
     _check_cut(kept, others, source)
     if not kept or max(len(names), *(len(row) for _, row in kept)) < LEAST_COLUMNS:
         return None
-    names, units, columns, letters = _apart(*_used(kept, names, units, sheet.first_column))
+    used = _used(kept, names, units, sheet.first_column)
+    (names, units, columns, letters), said = _without_copies(used, blocks[0], sheet.first_column)
     names, units, columns = _in_degrees(names, units, columns, " ".join(map(_text, above)))
     sign = decimal or figures.decimal_sign([c for column in columns for c in column], source)
     block = _titles_of(span, columns, others)
     texts = [figures.as_they_stand(column) for column in columns]
     names, read = _read(names, columns, texts, sign)
     whole, joined = _with_minutes(names, [cells for cells, _ in read])
-    stated = {
-        name: _both(unit, by_cells)
-        for name, unit, (_, by_cells) in zip(names, units, read, strict=True)
-    }
+    stated = {n: _both(unit, c) for n, unit, (_, c) in zip(names, units, read, strict=True)}
     return Layout(
         sheet=sheet.name,
         form=msgspec.structs.replace(
@@ -1359,6 +1437,7 @@ def _table(sheet: Sheet, span: _Span, source: str, decimal: str) -> Layout | Non
             (line, _words(row)) for line, row in [*others, *below] if not _repeats(row, rows, head)
         ),
         places=dict(zip(names, letters, strict=True)) if sheet.name else {},
+        remarks=said,
     )
 
 
@@ -1656,6 +1735,29 @@ def _used(
         [columns[k] for k in used],
         [letters_of(first + k) for k in used],
     )
+
+
+_Columns = tuple[list[str], list[str], list[list[object]], list[str]]
+"""Names, units, cells and letters of columns."""
+
+
+def _without_copies(each: _Columns, above: Block, first: int) -> tuple[_Columns, tuple[str, ...]]:
+    """The columns, as `_apart`, before those whose title says that they do not count, and a remark on these.
+
+    All of these have names of columns before them.
+    """
+    title = {letters_of(first + k): as_text(c) for k, c in enumerate(above[-1][1] if above else ())}
+    names, *_, letters = each
+    for place in range(LEAST_COLUMNS, len(names)):
+        text = title.get(letters[place], "")
+        plain = without_marks(text.lower())
+        if not (re.search(NOT_TO_USE, plain) or _OF_PAST_RUN.search(text)):
+            continue
+        if {re.sub(r" \(\d+\)$", "", name) for name in names[place:]} <= {*names[:place]}:
+            where = f"{letters[place]} to {letters[-1]}"
+            said = f"the columns {where} below {shown(text)} are not read: those before them have the same names."
+            return _apart(*(part[:place] for part in each)), (said,)  # type: ignore[arg-type]
+    return _apart(*each), ()
 
 
 def _apart(

@@ -63,6 +63,7 @@ _OF_PLACES = (
         r"inklinacja( pola)?|inclinazione (magn\w*|del campo)|plongement|pendage|magn\w* inclinatie|"
         r"(feld|feld-|magn\w* ?)?inklination|(feld-?|magn\w* )neigung|"
         r"(felt|magn\w* ?)?inklinasjon|(felt|magn\w* ?)helning|mergulho( magn\w*)?|inclinaca?o (magn?\w*|do campo)|"
+        r"inclinarea? (magn\w*|campului)|(goc )?(do )?tu khuynh|"
         r"inclinacion (magn\w*|del campo)|echado|buzamiento|inclinaison( magn\w*| du champ)?|"
         r"(магн\w* |угол )?накл(онени[ея])?\.?( мпз)?|(地)?磁倾角",
         "i",
@@ -91,7 +92,7 @@ _WRITTEN_UNIT = (
     r"n\s?t\b|[uµμ]\s?t\b|m\s?t\b|milli ?gauss|m\s?g(al|auss|s)?\b|gauss|gs\b|oe\b|a\s?/\s?m\b|gals?\b|gons?\b|"
     r"nano ?teslas?\b|micro ?teslas?\b|нтл|мктл|мтл|м?гал|гс\b|э\b|м/с²?|м/с2|"
     r"m\s?/\s?s\s?(?:²|\^?2)?|[gг]\b(?!\s*[=:(\[]?\s*(?:[+-]?\d|m\s?/))|°|deg\w*|gra[ud]\w*|rad\b|град\w*|"
-    r"fok|derece|stopni|度"
+    r"fok|derece|stopni|度|도\b"
 )
 _WRITTEN_NUMBER = (
     r"[+\-−]?\d{1,3}(?:[ '’.,\u00a0\u202f]\d{3})+(?:[.,]\d+)?(?!\d)|[+\-−]?\d+(?:[.,]\d+)?"
@@ -253,7 +254,7 @@ _ANOTHER_UNIT = re.compile(r"\s*[^\W\d_]{1,3}(?![^\W\d_])(?!\W*\d)")
 _ANOTHER = re.compile(
     rf"[\s;,/|)]*(?:[^\W\d_]{{3,}}[,;/]\s*(?={_WRITTEN_NUMBER}\W{{0,2}}\s[^\W\d_]{{3,}}))?(?:(?:and|or|und|oder|bzw|"
     rf"og|eller|y|o|e|ou|et|и|или|resp)(?![^\W\d_])\s*)?"
-    rf"(?P<number>{_WRITTEN_NUMBER})(?![./-]?\d)\s*(?:{_WRITTEN_UNIT}|(?!°|[^\W\d_]))"
+    rf"(?P<number>{_WRITTEN_NUMBER})(?![./-]?\d)\s*(?P<unit>{_WRITTEN_UNIT}|(?!°|[^\W\d_]))"
 )
 """A second value right behind one, or behind a name as the first is: 70.5 / 66.0, 70.5 Aberdeen, 58.1 Houston."""
 
@@ -344,7 +345,7 @@ _ALWAYS_WRITTEN = ("gon", "A/m", "mT", "gauss", "mG")
 """Units in which no bare number is read: 0.5 may be any factor."""
 _SPELT = {
     "нтл": "nT", "мктл": "µT", "мтл": "mT", "м/с": "m/s²", "м/с²": "m/s²", "м/с2": "m/s²", "m/s": "m/s²", "г": "g",
-    "град": "°", "度": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
+    "град": "°", "度": "°", "도": "°", "fok": "°", "derece": "°", "stopni": "°", "gal": "gal",
     "γ": "nT", "gammas": "nT", "kγ": "µT", "kgamma": "µT",
     "nanotesla": "nT", "nanoteslas": "nT", "microtesla": "µT", "microteslas": "µT",
     "a/m": "A/m", "oe": "gauss", "э": "gauss", "гс": "gauss", "мгс": "mG",
@@ -997,7 +998,8 @@ def _values(quantity: _Quantity, match: re.Match[str]) -> Iterator[float]:
     units = units[:1] if letter and not stated and quantity.low > EARTH_FIELD[0] - 1 else units
     inside = [*_inside(quantity, numbers, units)]
     other = _ANOTHER.match(match.string, match.end("unit" if match["unit"] else "number"))
-    others = _inside(quantity, _numbers(other["number"]), units) if other else ()
+    same = other and _stated_unit(quantity, other["unit"]) in ("", *quantity.units)
+    others = _inside(quantity, _numbers(other["number"]), units) if other and same else ()
     if len(inside) == 1:
         yield inside[0]
         yield from (v for v in others if abs(v - inside[0]) < abs(inside[0]) / 2)

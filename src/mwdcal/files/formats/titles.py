@@ -32,10 +32,14 @@ _TITLE_WORDS = {
     "serienr verktoynr instrumentnr numerodeserie nodeserie noserie nserie numeroserie nsserie numserie ndeserie "
     "matricola nrfabryczny numerfabryczny nrseryjny sondan sondano ferramentan ferramentano herramientan herramientano "
     "nomorseri noseri nomoralat noalat serinumarası cihazserino aletserino "
-    "製造番号 製造№ sarjanumero sarjano vyrobnicislo vyrc seriovecislo 일련번호 serino numardeserie serienummer "
+    "製造番号 製造№ sarjanumero sarjano vyrobnicislo vyrc seriovecislo 일련번호 제조번호 기기번호 serino gyariszam "
+    "sorozatszam seria nrserie nrserii numarserie serianr somay soseri somaydo заводськийномер заводський№ "
+    "серійнийномер серійний№ зауыттықнөмірі numardeserie serienummer "
     "заводской№ заводскойномер серийныйномер зав№ серийный№ прибор№ 序列号 编号 仪器编号 出厂编号",
-    "date": "date testdate caldate calibrationdate measured datum prufdatum messdatum dato kalibreringsdato fecha "
-    "data дата датакалибровки 日期 校准日期 测试日期",
+    "date": "date testdate caldate calibrationdate dateofcalibration measured logged datum prufdatum "
+    "messdatum dato kalibreringsdato fecha data дата датакалибровки 日期 校准日期 测试日期 标定日期 日付 "
+    "교정일 날짜 측정일 tarih tanggal ngay ngayhieuchuan datacalibrarii datakalibracji datakalibrace "
+    "paivamaara kuni күні",
     "operator": "operator technician measuredby testedby by bediener prufer operateur operador tecnico operatoer "
     "utfortav оператор исполнитель 操作员 检定员",
     "lab": "lab laboratory labor laboratorium laboratorio лаборатория 实验室",
@@ -51,6 +55,42 @@ _DAYS = (
     "%Y年%m月%d日",
 )
 """Forms of a day that can be read in one way only; in Germany, Norway and Russia a point stands behind the day."""
+_MONTHS = (
+    r"jan\w*|ene\w*|gen\w*|ian\w*|янв\w*|січ\w*|oca\w*|sty\w*|led\w*|tammi\w*",
+    r"feb\w*|fev\w*|фев\w*|лют\w*|sub\w*|lut\w*|unor\w*|helmi\w*",
+    r"mar\w*|maart|mrt|maerz|mac|мар\w*|берез\w*|brez\w*|maalis\w*",
+    r"apr\w*|abr\w*|avr\w*|апр\w*|квіт\w*|nis\w*|kwi\w*|dub\w*|apir\w*|huhti\w*",
+    r"ma[iyj]\w*|mei|mag\w*|ма[ия]\w*|трав\w*|kvet\w*|touko\w*",
+    r"jun\w*|jui?n|giu\w*|iun\w*|июн\w*|черв\w*|haz\w*|cze\w*|cerv(en|na)|kesa\w*",
+    r"jul\w*|juil\w*|lug\w*|iul\w*|июл\w*|лип\w*|tem(muz)?|lip\w*|cervenec|cervence|heina\w*",
+    r"aug\w*|ago\w*|aou\w*|авг\w*|серп\w*|agu\w*|sie\w*|srp\w*|elo\w*",
+    r"sep\w*|set\w*|szep\w*|сен\w*|вер\w*|eyl\w*|wrz\w*|zari\w*|syys\w*",
+    r"o[ck]t\w*|ott\w*|out\w*|окт\w*|жовт\w*|eki\w*|paz\w*|rij\w*|loka\w*",
+    r"nov\w*|nop\w*|noi\w*|ноя\w*|лист\w*|kas\w*|lis\w*|marras\w*",
+    r"de[czks]\w*|dic\w*|dez\w*|дек\w*|груд\w*|ara(lik)?|gru\w*|pros\w*|joulu\w*",
+)
+"""Beginnings of the months in the languages of laboratories, without marks."""
+_IN_WORDS = (
+    re.compile(
+        r"(?P<d>\d{1,2})(?:st|nd|rd|th|er|\.|º|°|-?го)?[\s-]*(?:d[ei]l? )?(?P<m>[^\W\d_]{3,})\.?,?[\s-]*(?:d[ei]l? )?"
+        r"(?P<y>(?:19|20)\d\d)(?:\s*(?:г\.?|года?|р\.?|року))?"
+    ),
+    re.compile(
+        r"(?P<m>(?:jan|feb|mar|apr|may|jun|jul|aug|sep|oct|nov|dec)[a-z]*)\.? (?P<d>\d{1,2})(?:st|nd|rd|th)?,?\s+"
+        r"(?P<y>(?:19|20)\d\d)"
+    ),
+    re.compile(r"(?P<y>(?:19|20)\d\d)\.?,?[\s-]+(?P<m>[^\W\d_]{3,})\.?[\s-]*(?P<d>\d{1,2})\.?"),
+)
+"""Forms of a day with the month in words."""
+_IN_NUMBERS = re.compile(
+    r"(?P<y>(?:19|20)\d\d)\s*[年년]\s*(?P<m>\d{1,2})\s*[月월]\s*(?P<d>\d{1,2})\s*[日일]|"
+    r"(?:ngay )?(?P<day>\d{1,2}) thang (?P<month>\d{1,2}) nam (?P<year>(?:19|20)\d\d)"
+)
+"""Forms of a day with the words for year, month and day."""
+_MONTH_FIRST = re.compile(
+    r"(?<![^\W\d_])([^\W\d_]{3,9}\.? \d{1,2}(?:st|nd|rd|th)?),\s+(?=(?:19|20)\d\d\b)"
+)
+"""A month and a day before the comma and the year: August 22, 2024."""
 OF_REFUSAL = (
     r"reject(ed)?|bad|invalid|void|voided|discard(ed)?|unusable|omit(ted)?|excluded?|scrap(ped)?|do not use|dnu|"
     r"n\.? ?ok|nok|not ok|no good|n\.o\.k\.?|verworfen|ungultig|schlecht|fehlmessung|unbrauchbar|gestrichen|"
@@ -63,7 +103,7 @@ OF_REFUSAL = (
     r"a rejeter|not used|unused|scartat[aeio]|ongeldig|afgekeurd|無効|除外|"
     r"cancell?ed|not (accepted|valid)|"
     r"gecersiz|iptal( edildi)?|reddedildi|hatal[ıi]|bozuk|[cç][ıi]kar[ıi]ld[ıi]|"
-    r"odrzuc(on[aey]|ic)|uniewaznion[aey]|niewazn[aey]|b[lł]edn[aey]|anulowan[aey]|skreslon[aey]|pominiet[aey]|"
+    r"odrzuc(on[aeoy]|ic)|uniewaznion[aeoy]|niewazn[aey]|b[lł]edn[aey]|anulowan[aey]|skreslon[aey]|pominiet[aey]|"
     r"wykluczon[aey]|do (odrzuceni|usunieci)a|nieprawid[lł]ow[aey]|"
     r"ditolak|tidak (valid|sah|ok)|batal|dibatalkan|dibuang|gagal|"
     r"(da )?scartare|non valid[aeio]|annullat[aeio]|esclus[aeio]|rifiutat[aeio]|"
@@ -138,8 +178,9 @@ _BEHIND_MODEL = re.compile(
 """The word for the tool, its model, and its serial behind a mark: Sonde SD-9 n° 112."""
 _OF_CAPITALS = r"[A-ZА-Я]{1,5}\d{0,3}[-/]?\d[\w/-]*"
 _BY_NAME = re.compile(
-    rf"(?i:{_OF_TOOLS}|modul)(?i:[a-zа-яё]{{0,3}})\s*:?\s+"
-    rf"(?P<tool>{_OF_CAPITALS}|[A-ZА-Я]{{1,5}} (?!(?:19|20)\d\d\b)\d{{1,6}}(?:(?: / |-)\d+)?)(?![\w.,°-])"
+    rf"(?i:{_OF_TOOLS}|modul)(?i:[a-zа-яё]{{0,3}})(?: (?i:nr|no)\.)?\s*:?\s+"
+    rf"(?P<tool>{_OF_CAPITALS}|[A-ZА-Я]{{1,5}}(?:-[A-ZА-Я]{{1,5}})? (?!(?:19|20)\d\d\b)\d{{1,6}}(?:(?: / |-)\d+)?)"
+    r"(?![\w.,°-])"
     r"(?!\s*(?i:n[°ºr]|no\b|№|s/?n))|"
     r"^\W*(?i:\w*(?:kalibr|calibra|justier)\w*|(?:калибр|тариров|градуиров)\w*|标定|校准)\s+"
     rf"(?P<run>{_OF_CAPITALS})(?![\w.°])"
@@ -149,7 +190,7 @@ _WITH_MARK = re.compile(
     r"(?:(?<![^\W\d_])|(?<=[\u4e00-\u9fff]))(?:(?P<word>serial(?:[ -]?(?:number|num|no|nr))?|"
     r"(?:[^\W\d_]+-?)?serien?-?(?:nummer|nr)|"
     r"(?:n[°ºo.r]*|n[uú]m\w*|nr)\.? (?:d[ei] )?(?:s[eé]ri[ea]l?|fabr\w*|seryjny)|"
-    r"s[eé]rie(?!\s+\d{1,2}(?![\w./-]))|"
+    r"s[eé]ri[ea](?!\s+\d{1,2}(?![\w./-]))|"
     r"fabr(?:ik)?\.?[ -]?(?:nr|nummer)|matricola|"
     r"зав\w*\.? ?(?:№|номер|n)|серийн\w* ?(?:№|номер)|seri ?no|序列号|编号|製造番号)|s\.?/?n|[^\W\d_]+[ -]sn|"
     r"(?<=[,(;] )(?:n[°ºr]\.?|num[eé]ro|№))\.?"
@@ -189,8 +230,8 @@ V is west in Norwegian and east in Czech, O is east in German and west in French
 """
 _TURN_EAST = (
     r"(?:\s+mag[^\W\d_]*)?(?:\s+(?:at|am|ved|en|in|on)\s+(?:the\s+)?[^\W\d_]+)?"
-    rf"(?P<note>(?:[\s,;:]*(?:\([^)]*\)|\[[^\]]*\]|(?:deg\w*|grad\w*|gra[du][os]?s?|positive|{_SENSE})(?![^\W\d_])))*)"
-    r"[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*|gra[du]\w*|град\w*)?"
+    rf"(?P<note>(?:[\s,;:]*(?:\([^)]*\)|\[[^\]]*\]|(?:deg\w*|grad\w*|gra[du][os]?s?|град\w*|гр|positive|{_SENSE})(?![^\W\d_])))*)"
+    r"[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*|gra[du]\w*|град\w*|гр)?"
     r"(?:\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*(?:['′’]|min\w*))?"
     r"\s*[(\[]?(?:(?:mot|nach|to\w*|the|al?|hacia|vers)\s+)*(?P<sense>[^\W\d_]++(?!\s*[+(]|\W*\d))?"
 )
@@ -223,13 +264,14 @@ class Titles(NamedTuple):
     """Metadata by key, and a day that may be read in two ways, as it stands.
 
     `not_taken` are lines with a nominal or approximate reference, by column of a run file; `choices` are references
-    of which lines state different values; `others` lines with another value than the one taken, and it.
+    of which lines state different values, or serials of sheets; `others` lines with another value than the one
+    taken, and it.
     """
 
     metadata: Mapping[str, object]
     unclear_day: str = ""
     not_taken: Mapping[str, str] = {}
-    choices: Mapping[str, tuple[float, ...]] = {}
+    choices: Mapping[str, tuple[float | str, ...]] = {}
     others: Mapping[str, tuple[str, float]] = {}
 
 
@@ -254,7 +296,7 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
         text = " ".join(whole)
         declination = _rotation(_DECLINATION, text) if declination is None else declination
         convergence = _rotation(_CONVERGENCE, text) if convergence is None else convergence
-        true = true or bool(_TRUE_NORTH.search(text))
+        true = true or bool(_TRUE_NORTH.search(text) and "?" not in text)
         marked = _marked_in(" ; ".join(whole)) or _BEHIND_MODEL.findall(text) or _named_in(text)
         for place, cell in enumerate(cells):
             key, value = _pair(cell, cells[place + 1 :])
@@ -292,7 +334,7 @@ def tool_in(row: Sequence[object]) -> str:
 
 def _parts(cell: str) -> list[str]:
     """The facts in a cell; of a key in two languages (Serial / Serie) the first."""
-    whole = _TWO_NUMBERS.sub("\\1\\2\0", cell)
+    whole = _MONTH_FIRST.sub("\\1 ", _TWO_NUMBERS.sub("\\1\\2\0", cell))
     parts = [part.replace("\0", " ") for part in _PARTS.split(whole)]
     label = len(parts) > 1 and _word(parts[0]) in _MEANT and not re.search(r"[\d:=]", cell)
     return parts[:1] if label else parts
@@ -380,8 +422,13 @@ def _tool(cell: str, right: Sequence[str]) -> str:
 def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
     """The key that a cell is, and its value behind a colon, a sign or in the next cell that is filled in."""
     head, *tail = re.split(r"\s*[:：=|]\s*", cell, maxsplit=1)
+    first, _, behind = cell.partition(" ")
+    if _MEANT.get(_word(first)) == "date" and day_of(behind, True):
+        return "date", behind
     word = _word(head.lstrip("#"))
+    inside = [_MEANT.get(_word(text)) for text in re.findall(r"[(\[](.*?)[)\]]", head)]
     key = _MEANT.get(word, "serial" if _NUMBER_OF_TOOL.fullmatch(word) else "")
+    key = key or ("serial" if "serial" in inside and not _OF_EQUIPMENT.search(head) else "")
     if not key:
         return "", ""
     return key, "".join(tail).strip(' "') or next(
@@ -400,11 +447,15 @@ def day_of(text: str, day_first: bool = False) -> str:
     `day_first`: of 03/04/2025 the 3 is the day, as everywhere but in English. With AM or PM the month is first.
     """
     first, *time = re.split(r"[T ]+(?=\d\d?:)", text.strip(), maxsplit=1)
+    first = re.sub(r"(?<=\d)\.\s+(?=\d)", ".", first)
+    first = first.rstrip(".") if first.count(".") == 3 else first
     for form in _DAYS:
         try:
             return datetime.strptime(first, form).date().isoformat()
         except ValueError:
             continue
+    if day := _day_in_words(first):
+        return day
     match = re.fullmatch(r"(\d\d?)([/.-])(\d\d?)\2(\d{4})", first)
     if not match:
         return ""
@@ -428,6 +479,32 @@ def _day_of_number(text: str) -> str:
     days = int(text) if re.fullmatch(r"\d{5}", text) else 0
     first, last = _DAY_NUMBERS
     return (date(1899, 12, 30) + timedelta(days)).isoformat() if first <= days <= last else ""
+
+
+def _day_in_words(text: str) -> str:
+    """A day whose month is a word of any language, or a number with the word for a month; in ISO form.
+
+    >>> [_day_in_words(t) for t in ("21 de mayo de 2024", "August 22, 2024", "2024년 2월 21일", "14. Mai", "1 st 2024")]
+    ['2024-05-21', '2024-08-22', '2024-02-21', '', '']
+    """
+    plain = without_marks(text.translate(_SPECIAL_LETTERS).lower())
+    match = _IN_NUMBERS.fullmatch(plain)
+    if match:
+        year, month, day = (
+            match[short] or match[long] for short, long in zip("ymd", _PARTS_OF_DAY, strict=True)
+        )
+    elif match := next(filter(None, (form.fullmatch(plain) for form in _IN_WORDS)), None):
+        months = [k for k, words in enumerate(_MONTHS, 1) if re.fullmatch(words, match["m"])]
+        year, month, day = match["y"], str(months[0] if len(months) == 1 else 0), match["d"]
+    else:
+        return ""
+    try:
+        return date(int(year), int(month), int(day)).isoformat()
+    except ValueError:
+        return ""
+
+
+_PARTS_OF_DAY = ("year", "month", "day")
 
 
 def dated(
