@@ -26,6 +26,22 @@ from mwdcal.files.formats.titles import titles
         ("Declination (west pier) [deg]", "2.40", 2.4),
         ("Misvisning [grader]", "2,4", 2.4),
         ("Deklination [Grad]", "2,4 O", 2.4),
+        ("Misvisning", "2,35 V", -2.35),
+        ("Misvisning", "2,35° V", -2.35),
+        ("Misvisning (V)", "2,35", -2.35),
+        ("Misvisning", "2,35 grader vest", -2.35),
+        ("Misvisning", "2,35 mot vest", -2.35),
+        ("Misvisning", "2,35 Ø", 2.35),
+        ("Missvisning", "2,35 O", 2.35),
+        ("Deklination", "2,35° V", -2.35),
+        ("Déclinaison", "2,35 O", -2.35),
+        ("Declinación", "2,35 O", -2.35),
+        ("Declinação", "2,35 L", 2.35),
+        ("Deklinace", "2,35 Z", -2.35),
+        ("Склонение", "2,35 З", -2.35),
+        ("Склонение", "2,35 В", 2.35),
+        ("磁偏角", "2.35° 西", -2.35),
+        ("Declination", "2.35 F 50612 nT", 2.35),
     ],
 )
 def test_a_declination_is_read_behind_its_unit_and_sense(
@@ -41,6 +57,10 @@ def test_a_declination_is_read_behind_its_unit_and_sense(
         "Declination [rad] 0.04",
         "Declination (min) 144",
         "Declination σ 0.1",
+        "Declination 2.35 O",
+        "Declination 2.35 V",
+        "Deklinacja 2,35 W",
+        "Misvisning 2,35 N",
     ],
 )
 def test_a_declination_that_is_not_understood_is_listed(line: str) -> None:
@@ -48,3 +68,18 @@ def test_a_declination_that_is_not_understood_is_listed(line: str) -> None:
     block = stated_above([[line]])
     assert "declination_deg" not in block.metadata
     assert block.not_taken == {"declination_deg": line}
+
+
+@pytest.mark.parametrize(
+    ("row", "day"),
+    [
+        (["Dato", 46350], "2026-11-24"),
+        (["Date", "45658"], "2025-01-01"),
+        (["Datum:", 43890], "2020-02-29"),
+        (["Date", 20261], None),
+        (["Order", 46350], None),
+    ],
+)
+def test_a_number_beside_a_word_for_the_date_is_the_day_that_a_workbook_stores(row, day) -> None:
+    """Days of LibreOffice Calc: =DATE(2026;11;24) as a number is 46350."""
+    assert titles([row]).metadata.get("date") == day

@@ -290,7 +290,7 @@ def test_surveys_without_references_are_not_judged_and_a_serial_is_a_column(cal,
     well.report(tmp_path / "well.html")
     assert "36 surveys not judged by the limits owsg-mwd" in (tmp_path / "well.html").read_text()
     said = {finding.id: finding.text for finding in well.findings}
-    assert said["no-serial"].startswith("no serial in the readings: nothing shows")
+    assert said["no-serial"].startswith("no serial in the readings: mwdcal cannot check")
     with_serial = mc.survey(cal, {**table, "serial": ["SIM-0001"] * 36})
     assert said.keys() - {f.id for f in with_serial.findings} == {"no-serial"}
 

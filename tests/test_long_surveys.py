@@ -111,6 +111,7 @@ def bare(columns, rng):
 
 def swapped(columns, rng):
     columns["mx"], columns["my"] = columns["my"], columns["mx"]
+    columns["declination_deg"] = [repr(value) for value in np.linspace(-2, 1, ROWS).tolist()]
     for name in ("ref_gravity_g", "ref_field_nt", "ref_dip_deg"):
         del columns[name]
 

@@ -188,3 +188,16 @@ def test_a_single_cell_with_the_other_decimal_sign_is_not_that_of_the_table(tmp_
     assert "line 10" in message
     assert "Correct this one" in message
     assert "--decimal" not in message
+
+
+def test_a_table_without_any_angle_of_the_profile_is_said_to_have_none(own, tmp_path):
+    columns = {
+        name: values for name, values in table().items() if name[:2] not in ("In", "Az", "TF")
+    }
+    assert len(table()) - len(columns) == 3
+    written(tmp_path / "b.csv", columns)
+    ran = mwdcal(
+        "calibrate", tmp_path / "b.csv", "--tool", own / "t.toml", "-o", tmp_path / "c.json"
+    )
+    assert "! the table has no angles of the stand: the tool profile's columns" in ran.err
+    assert ABSENT in ran.err.partition("no angles of the stand")[2].partition("\n")[0]

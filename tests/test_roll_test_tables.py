@@ -322,3 +322,26 @@ def test_python_says_where_a_roll_test_goes_and_which_names_it_expects(tmp_path,
     assert table["station"].tolist()[:2] == ["1", "2"]
     assert table["temperature_c"].tolist()[0] == 25.0
     assert [*table.columns][2:] == [*library.apply(cal, run).columns]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"), [("Serial AB-17", False), ("Rulletest etter kalibrering AB-18", True)]
+)
+def test_a_roll_test_without_a_serial_of_its_own_is_said_to_have_none(
+    laboratory, tmp_path, line, said
+):
+    """The run states AB-17; a number in a title without a word for it is no serial."""
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    run = run_in_gauss(servo_run(), SPANISH_RUN)
+    sheet_of(book, "Calibración", run, ["Serial AB-17"])
+    sheet_of(book, "Rulletest", rolled(TESTS["Rulletest"]), [line])
+    path = tmp_path / "run.xlsx"
+    book.save(path)
+    ran = mwdcal(
+        "calibrate", path, "--tool", laboratory[0] / "tool.toml", "-o", tmp_path / "c.json",
+        "--rolltest", path, "--json",
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    found = {f["id"] for f in [*ran.json["findings"], *ran.json["verification"]["findings"]]}
+    assert ("no-serial" in found) is said

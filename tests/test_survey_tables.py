@@ -548,3 +548,20 @@ def test_profile_of_surveys_names_survey(tmp_path):
     del table["MD"]
     path = workbook(tmp_path / "RUN.xlsx", W=table)
     assert "mwdcal calibrate" in cli("profile", path, "-o", tmp_path / "run.toml").out
+
+
+@pytest.mark.parametrize(("stated", "east"), [("2,35 V", -2.35), ("2,35 N", None)])
+def test_a_declination_is_used_or_its_line_is_named(tmp_path, laboratory, stated, east):
+    """V is west in Norwegian; N is no direction of a declination."""
+    path = workbook(tmp_path / "WELL.xlsx", W=well_table())
+    book = openpyxl.load_workbook(path)
+    book["W"].insert_rows(1, 2)
+    book["W"]["A1"], book["W"]["B1"] = "Misvisning", stated
+    book.save(path)
+    well = mc.survey(laboratory[1], path)
+    texts = [f.text for f in well.findings if f.id == "magnetic-north"]
+    if east is None:
+        assert [f"'Misvisning {stated}' is not understood" in text for text in texts] == [True]
+    else:
+        turned = well.columns["azimuth_true_deg"] - well.columns["azimuth_magnetic_deg"]
+        assert np.nanmax(np.abs((turned - east + 180) % 360 - 180)) < 1e-9

@@ -1458,11 +1458,15 @@ def test_a_declination_by_row_turns_each_row_by_its_own(example, tmp_path):
     assert np.sqrt(stated**2 - rest**2) == pytest.approx(north, rel=0.01)
 
 
-def test_declinations_by_row_about_180_degrees_have_a_mean_there(example, tmp_path):
-    """Expected: the direction of the sum of unit vectors at the declinations."""
+@pytest.mark.parametrize("name", ["ref_declination_deg", "declination_deg"])
+def test_declinations_by_row_about_180_degrees_have_a_mean_there(example, tmp_path, name):
+    """Expected: the direction of the sum of unit vectors at the declinations; by the metadata key as well."""
     cells = np.where(np.arange(36) % 3 == 0, 179.7, -179.9)
-    rows = {"ref_declination_deg": [repr(value) for value in cells.tolist()]}
-    _, document = surveyed_file(example, tmp_path, rows, *BY_CALIBRATION)
+    rows = {name: [repr(value) for value in cells.tolist()]}
+    columns, document = surveyed_file(example, tmp_path, rows, *BY_CALIBRATION)
+    turned = floats(columns["azimuth_true_deg"]) - floats(columns["azimuth_magnetic_deg"])
+    np.testing.assert_allclose(turned % 360, cells % 360, atol=1e-9)
+    assert "unused-columns" not in {each["id"] for each in document["findings"]}
     mean = np.degrees(np.angle(np.exp(1j * np.radians(cells)).sum()))
     assert document["declination_deg"] == pytest.approx(mean, abs=1e-5)
 

@@ -548,6 +548,19 @@ def test_radians_under_degrees_are_told_by_the_readings(tmp_path):
     assert toolface == pytest.approx(servo_run()["ref_toolface_deg"])
 
 
+@pytest.mark.parametrize("line", ["Fluxgate (V/µT),0.05", "Fluxgates 20 µT/V"])
+@pytest.mark.parametrize(("field", "contradicted"), [("50000", False), ("56000", True)])
+def test_a_sensitivity_above_the_names_shows_a_field_that_is_mistyped(
+    tmp_path, line, field, contradicted
+):
+    """The channels give 5e-5 V a nT in a field of 50,000 nT: in one of 56,000 nT a ninth less."""
+    columns = table(ref_field_nt=None)
+    path = written(tmp_path / "a.csv", columns, line, f"Total field (nT),{field}")
+    findings = findings_of(library.propose_profile(path))
+    assert ("unit-contradicted" in findings) == contradicted
+    assert not contradicted or "is the field 56000 nT?" in findings["unit-contradicted"]
+
+
 @pytest.mark.parametrize(("factor", "contradicted"), [(1.0, False), (1e-3, True), (0.9, True)])
 def test_a_unit_that_the_readings_contradict_is_named(tmp_path, factor, contradicted):
     """Under nT there are µT, or a field that is a tenth too small."""

@@ -223,6 +223,50 @@ def test_a_left_handed_accelerometer_alone_is_said_unless_it_counts_upwards(tmp_
     assert ("left-handed" in findings(ran)) is said
 
 
+def test_azimuths_half_a_turn_off_are_a_cause_beside_the_sign_of_the_dip(tmp_path):
+    """A field turned by 180° of azimuth and of opposite dip is the field reversed; the table's azimuths are off."""
+    run = servo_run()
+    run["ref_azimuth_deg"] = (run["ref_azimuth_deg"] + 180) % 360
+    out = "-o", tmp_path / "t.toml"
+    message = refused(mwdcal("profile", write_csv(tmp_path / "r.csv", run), *out), 3)
+    assert "all azimuths of the stand are 180° off, or the sign of the dip is wrong" in message
+    run["ref_dip_deg"] = -run["ref_dip_deg"]
+    ran = mwdcal("profile", write_csv(tmp_path / "s.csv", run), *out, "--json")
+    assert "all azimuths of the stand are 180° off" in findings(ran)["left-handed"]
+
+
+@pytest.mark.parametrize(
+    ("turn", "names", "said"),
+    [(0, NAMES, False), (180, NAMES, True), (90, NAMES, True), (180, {"ax": "Accel 1 (V)"}, False)],
+)
+def test_a_tool_turned_in_the_stand_is_named_where_channels_say_their_axes(
+    tmp_path, turn, names, said
+):
+    """The stand's toolface is `turn` less than the tool's."""
+    run = servo_run()
+    run["ref_toolface_deg"] = (run["ref_toolface_deg"] - turn) % 360
+    table = write_csv(tmp_path / "r.csv", named(run, **names))
+    answers = ["--column", "ax=Accel 1 (V)"] if "1" in names["ax"] else []
+    ran = mwdcal("profile", table, "-o", tmp_path / "t.toml", "--json", *answers)
+    found = findings(ran)
+    assert ("turned-about-z" in found) is said
+    assert not said or f"turned by {turn}°" in found["turned-about-z"]
+
+
+@pytest.mark.parametrize("name", ["ref_toolface_deg", "ref_azimuth_deg"])
+@pytest.mark.parametrize(("first", "last"), [(8, 15), (0, 2)])
+def test_an_angle_half_a_turn_off_at_some_stations_is_named_with_their_rows(
+    tmp_path, name, first, last
+):
+    """Names stand in line 1 of the file, station 0 in line 2."""
+    run = servo_run()
+    run[name][first : last + 1] = (run[name][first : last + 1] + 180) % 360
+    table = write_csv(tmp_path / "r.csv", named(run))
+    message = refused(mwdcal("profile", table, "-o", tmp_path / "t.toml"), 3)
+    where = f"'{NAMES[name]}' is 180° off from line {first + 2} to line {last + 2}, and fits"
+    assert where in message
+
+
 # --------------------------------------------------------------------------------------- roll test
 
 

@@ -2,7 +2,7 @@
 
 True azimuth = magnetic + declination; grid azimuth = true - convergence. Metadata
 `azimuth_reference` is "magnetic" (the default), "true" or "grid". `declination_deg` without
-`azimuth_reference` changes nothing: the azimuths are magnetic.
+`azimuth_reference` turns surveys to true north; the azimuths of a stand stay magnetic.
 """
 
 from __future__ import annotations

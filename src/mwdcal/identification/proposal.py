@@ -48,7 +48,7 @@ from mwdcal.files.formats.layout import NO_READING, WITHOUT_VALUE, Layout, warmt
 from mwdcal.files.formats.table import Table, cell_error, labels, numbers
 from mwdcal.files.formats.table import labels as labels_of
 from mwdcal.files.formats.text import is_preamble
-from mwdcal.files.formats.title_references import references_in
+from mwdcal.files.formats.title_references import references_in, sensitivity_in
 from mwdcal.files.marks import (
     MARKS_NAMED,
     UNMARKED,
@@ -76,7 +76,7 @@ from mwdcal.files.statements import stated_table
 from mwdcal.files.synonyms import ABOVE, ANTICLOCKWISE, BELOW, FACTORS, OURS, WARMTH
 from mwdcal.geometry.circle import resultant
 from mwdcal.geometry.observables import OBSERVABLES
-from mwdcal.geometry.vectors import Array, Bools, tool_from_earth
+from mwdcal.geometry.vectors import Array, Bools, Ints, tool_from_earth
 from mwdcal.identification.beside import findings_beside, has_roll_test, roll_tests_beside
 from mwdcal.identification.columns import (
     MEASURED_BY_TOOL,
@@ -1083,6 +1083,7 @@ def _wired(
     columns = profile.columns
     assert not isinstance(columns, msgspec.UnsetType)
     _check_gravity(readings, columns)
+    _check_half_turns(run, readings, columns)
     wirings, open_axes = _wirings(run, readings, scaled)
     if "magnetometer" in open_axes:
         _check_sense(run, readings, scaled, columns)
@@ -1336,6 +1337,7 @@ def _check_magnetic(
 
 _ANOTHER_DIP = 3.0
 """By how much a dip that is stated differs from that of the readings where it is of another place, degrees."""
+_OPPOSITE_DIP = "Either all azimuths of the stand are 180° off, or the sign of the dip is wrong."
 
 
 def _check_dip(table: Table, profile: Profile, answers: Collection[str]) -> None:
@@ -1360,9 +1362,11 @@ def _check_dip(table: Table, profile: Profile, answers: Collection[str]) -> None
         _, seen = field_direction(readings, {} if open_axes else wirings)
     if abs(seen - stated) > _ANOTHER_DIP:
         where = shown(named.name) if named else "a line above the table"
+        turned = abs(seen + stated) < _ANOTHER_DIP
+        question = _OPPOSITE_DIP if turned else "Is the latter that of another place or sign?"
         raise QuestionError(
-            f"{table.source}: by the readings the dip is {seen:.1f}°, and by {where} {stated:.1f}°. Is the latter that "
-            "of another place or sign? Correct a wrong sign in the table; a blank answer leaves the dip out, and the "
+            f"{table.source}: by the readings the dip is {seen:.1f}°, and by {where} {stated:.1f}°. {question} Correct "
+            f"{'the wrong one' if turned else 'a wrong sign'} in the table; a blank answer leaves the dip out, and the "
             "calibration finds it.",
             [
                 Answer(
@@ -1579,6 +1583,59 @@ def _check_gravity(readings: Readings, columns: Mapping[str, ColumnSource]) -> N
     )
 
 
+_LEAST_TURNED = 3
+"""Consecutive stations from which on an angle that is half a turn off is no single slip."""
+
+
+def _check_half_turns(run: Table, readings: Readings, columns: Mapping[str, ColumnSource]) -> None:
+    """Refuse an angle that is half a turn off at consecutive stations, where the readings fit it at all others."""
+    for kind, name in (("accelerometer", "toolface"), ("magnetometer", "azimuth")):
+        column = REFERENCES[name].column
+        if column not in columns or getattr(readings, kind) is None:
+            continue
+        rows = _half_turned(readings, kind, name)
+        if len(rows) < _LEAST_TURNED:
+            continue
+        raise FitError(
+            f"{run.source}: by the readings {shown(columns[column].name)} is 180° off from {place(run, rows[0])} to "
+            f"{place(run, rows[-1])}, and fits at all other stations. Correct it there, or leave these rows out."
+        )
+
+
+def _half_turned(readings: Readings, kind: str, name: str) -> Ints:
+    """The stations, one behind the other, at which the readings of a triad fit an angle turned by 180° alone.
+
+    Each station counts as it fits the line of all better, until no more change. None where others lie between them,
+    where they are half of all, or where readings are left that neither angle explains.
+    """
+    none = np.empty(0, int)
+    turned = {**readings.known, name: readings.reference(name) + np.pi}
+    both = [
+        _regressors(each, kind, warm=False) for each in (readings, replace(readings, known=turned))
+    ]
+    raw = both[0][1]
+    designs = np.stack([np.column_stack([parts, np.ones(len(parts))]) for parts, _ in both])
+    count, width = designs.shape[1:]
+    if count < max(readings.count, 2 * _MOST_COLUMNS * width):
+        return none
+    chosen, off = np.zeros(count, int), np.zeros((2, count))
+    for _ in range(_MOST_ROUNDS):
+        slope, *_ = np.linalg.lstsq(designs[chosen, range(count)], raw, rcond=1e-9)
+        off = np.linalg.norm(raw - designs @ slope, axis=-1)
+        before, chosen = chosen, off.argmin(0)
+        if np.array_equal(before, chosen):
+            break
+    rows = np.flatnonzero(off[1] < _FAR_BETTER * off[0])
+    left = np.sqrt(np.mean(off.min(0) ** 2) / np.sum(raw.var(0)))
+    between = slice(rows.min(initial=count), rows.max(initial=-1) + 1)
+    apart = np.any(off[0, between] < _FAR_BETTER * off[1, between])
+    return none if apart or 2 * len(rows) >= count or left > _CONFIRMED else rows
+
+
+_MOST_ROUNDS = 20
+"""Times that stations are assigned to an angle or the one half a turn from it."""
+
+
 def _check_independent(readings: Readings, results: dict[str, Wiring]) -> None:
     """Refuse inclinations that were computed from the readings: they are no reference."""
     if "accelerometer" not in results:
@@ -1685,6 +1742,34 @@ def axes_open(proposal: Proposal) -> list[Finding]:
     ]
 
 
+_TURNS_ABOUT_Z: dict[tuple[str, ...], int] = {
+    ("-x", "-y", "+z"): 180,
+    ("+y", "-x", "+z"): 90,
+    ("-y", "+x", "+z"): 90,
+}
+"""Degrees by which channels x, y, z read as turned about the tool's axis, by their axes."""
+
+
+def turned_about_z(proposal: Proposal) -> list[Finding]:
+    """A finding on triads whose channels, called x, y and z, all read as turned about z by one angle."""
+    columns = proposal.profile.columns or {}
+    turns = {_TURNS_ABOUT_Z.get(each.axes, 0) for each in proposal.wirings.values()}
+    names = {
+        c: columns[c].name if c in columns else c
+        for kind in proposal.wirings
+        for c in CHANNELS[kind]
+    }
+    plain = all(re.search(rf"(?i:{c[1]})(?![^\W\d_])", name) for c, name in names.items())
+    if len({each.axes for each in proposal.wirings.values()}) != 1 or turns == {0} or not plain:
+        return []
+    turn = turns.pop()
+    text = (
+        f"the channels X and Y of {' and '.join(proposal.wirings)} read as turned by {turn}° about Z. Either the tool "
+        f"is wired so, or the toolface zero of the stand is {turn}° off (mark down?): then survey toolfaces are, too."
+    )
+    return [Finding(id="turned-about-z", text=text)]
+
+
 def one_inclination(proposal: Proposal) -> list[Finding]:
     """A finding on a table whose inclinations are too close to each other for a calibration."""
     if proposal.level is None:
@@ -1782,18 +1867,31 @@ def units_contradicted(proposal: Proposal) -> list[Finding]:
             )
             findings.append(Finding(id="unit-contradicted", text=text))
         scale = getattr(proposal.profile, kind).scale if kind in proposal.wirings else None
-        if not channel or not scale or channel.unit not in (base, *FACTORS):
-            continue
-        if (kind, channel.unit) == ("accelerometer", "mG"):
-            channel = msgspec.structs.replace(channel, unit="mg")
-        per_unit = 1 / FACTORS.get(channel.unit, (1.0, 0.0))[0]
-        if abs(np.log(scale / per_unit)) > OFF_UNIT:
+        nominal = _nominal_scale(proposal, channel, base) if channel else None
+        if nominal and scale and abs(np.log(scale / nominal[0])) > OFF_UNIT:
+            strength = stated_references(proposal).get("ref_field_nt" if base == "nT" else "", 0.0)
             text = (
-                f"{kind}: by its names {channel.unit}, of which {per_unit:g} make a {base}; by readings and references "
-                f"{scale:g} do. It is used in the scale of the readings. Check the unit and the references."
+                f"{kind}: {nominal[1]}; by readings and references {scale:g} do. It is used in the scale of the "
+                f"readings. Check the unit and the references{f': is the field {strength:g} nT?' if strength else '.'}"
             )
             findings.append(Finding(id="unit-contradicted", text=text))
     return findings
+
+
+def _nominal_scale(
+    proposal: Proposal, channel: ColumnSource, base: str
+) -> tuple[float, str] | None:
+    """The scale that the unit of a channel is, or a line above the names states, per g or nT, and where it is from."""
+    unit = "mg" if (base, channel.unit) == ("g", "mG") else channel.unit
+    if unit in (base, *FACTORS):
+        scale = 1 / FACTORS.get(unit, (1.0, 0.0))[0]
+        return scale, f"by its names {unit}, of which {scale:g} make a {base}"
+    lines = proposal.where.above if proposal.where else ()
+    stated = {s.scale for s in map(sensitivity_in, lines) if s and (s.raw, s.base) == (unit, base)}
+    if len(stated) != 1:
+        return None
+    scale = stated.pop()
+    return scale, f"by a line above the names {scale:g} {unit} make a {base}"
 
 
 def warmth_by_unit(proposal: Proposal) -> list[Finding]:
@@ -1850,6 +1948,7 @@ def findings_on(proposal: Proposal) -> list[Finding]:
         + one_inclination(proposal)
         + axes_open(proposal)
         + left_handed({kind: each.axes for kind, each in proposal.wirings.items()})
+        + turned_about_z(proposal)
         + lines_not_taken(proposal)
         + read_as_thousands(proposal)
         + marked

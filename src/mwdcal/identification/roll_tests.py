@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from mwdcal.calibration.diagnosis.findings import OF_ROLL_TEST
-from mwdcal.calibration.readings import TRIADS, Readings, serial_of
+from mwdcal.calibration.readings import TRIADS, Readings
 from mwdcal.calibration.record import Calibration
 from mwdcal.errors import (
     Answer,
@@ -29,7 +29,7 @@ from mwdcal.files.contract import AZIMUTH_KEYS, CHANNELS, RAW, REFERENCES, units
 from mwdcal.files.formats import table as tables
 from mwdcal.files.formats.columns import LABELS, shown
 from mwdcal.files.formats.layout import ROLL_TEST, Layout, is_part_of
-from mwdcal.files.formats.table import Table, labels
+from mwdcal.files.formats.table import Table
 from mwdcal.files.parting import parted, roll_test_marks
 from mwdcal.files.statements import Said, stated_table
 from mwdcal.files.synonyms import ABOVE, BELOW, FACTORS, unit_of
@@ -308,7 +308,7 @@ def _under_names_of_run(
     sources = runs.sources_of(profile).items()
     columns = {*table.columns, *(c for c, each in sources if each.name in table.columns)}
     table = _with_remark(_with_run(table, profile, said), table.metadata, columns)
-    table = _stated(table, said, runs.serial_column(table, profile))
+    table = stated_table(table, said.statements, runs.serial_column(table, profile))
     return runs.read_run(table, profile)[0]
 
 
@@ -339,7 +339,8 @@ def _by_meaning(
         runs.sources_of(profile),
     )
     table = replace(table, remarks=(*table.remarks, *_sentences(where, columns, profile)))
-    table = _stated(_with_remark(table, of_table, columns), said, runs.serial_column(table, theirs))
+    table = _with_remark(table, of_table, columns)
+    table = stated_table(table, said.statements, runs.serial_column(table, theirs))
     readings = runs.read_run(table, theirs)[0]
     _check_strengths(readings, columns, runs.sources_of(profile))
     return readings
@@ -364,15 +365,6 @@ def _with_remark(table: Table, of_table: Mapping[str, object], columns: Collecti
         f"{OF_ROLL_TEST} takes from its run what its own table does not state: {', '.join(taken)}."
     )
     return replace(table, remarks=(*table.remarks, *[text] * bool(taken)))
-
-
-def _stated(table: Table, said: Said, column: str) -> Table:
-    """A roll test with what the user says of it, else with the serial of its run; `column` has serials."""
-    known = serial_of(table.metadata) or any(labels(table, column))
-    serial = "" if known else str(said.of_run.get("serial", ""))
-    return stated_table(
-        table, {**({"serial": serial} if serial else {}), **said.statements}, column
-    )
 
 
 def known_columns(table: Table, where: Layout | None, profile: Profile) -> dict[str, str]:

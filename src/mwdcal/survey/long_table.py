@@ -45,9 +45,10 @@ from mwdcal.survey.axes import exchanged_axes
 from mwdcal.survey.error_model import BUILT_IN, ErrorModel
 from mwdcal.survey.path import TieIn
 from mwdcal.survey.references import Claim, EarthReference
-from mwdcal.survey.stations import DECLINATIONS, horizontal_field, norths_of
+from mwdcal.survey.stations import horizontal_field, norths_of
 from mwdcal.survey.surveying import (
     BY_ROW,
+    DECLINATION_COLUMNS,
     SurveyedWell,
     SurveyReadings,
     WellInputs,
@@ -222,7 +223,7 @@ class _LongTable:
 
     def _by_row(self) -> dict[str, Array]:
         """The columns of a declination that varies by row, of the whole table."""
-        if DECLINATIONS[0] not in self.source.names:
+        if not {*DECLINATION_COLUMNS} & {*self.source.names}:
             return {}
         parts = [by_row(table) for table in self._tables()]
         return {n: np.concatenate([each[n] for each in parts]) for n in parts[0]}

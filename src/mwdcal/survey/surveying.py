@@ -19,6 +19,7 @@ from mwdcal.calibration.record import Calibration, Finding
 from mwdcal.errors import InputError
 from mwdcal.files import synonyms
 from mwdcal.files.contract import (
+    AZIMUTH_KEYS,
     REFERENCES,
     ROTATION,
     check_columns,
@@ -73,8 +74,10 @@ NO_MODEL = "none"
 """The word for standard uncertainties of calibration, noise and declination alone."""
 RANDOM_COLUMNS = {f"sd_random_{REFERENCES[name].column}": RANDOM + name for name in CONSTANTS}
 """Columns of what gravity, field and dip are uncertain by anew at every row, by their names in `Readings.sd`."""
+DECLINATION_COLUMNS = (DECLINATIONS[0], AZIMUTH_KEYS[1])
+"""Names of the column of a declination that varies by row: that of a reference, and the key that metadata have."""
 BY_ROW = {
-    DECLINATIONS[0]: ROTATION,
+    **dict.fromkeys(DECLINATION_COLUMNS, ROTATION),
     **dict.fromkeys(DECLINATIONS[1:], REFERENCES["dip"].uncertainty),
     **{f"sd_random_{REFERENCES[name].column}": REFERENCES[name].uncertainty for name in CONSTANTS},
 }
@@ -189,16 +192,17 @@ def by_row(table: Table) -> dict[str, Array]:
             problem = f"must be {limits}; got {values[wrong[0]]:g}."
             raise cell_error(table, name, int(wrong[0]), problem)
         result[name] = values
-    declination = result.get(DECLINATIONS[0])
-    if declination is None:
+    column = next((name for name in DECLINATION_COLUMNS if name in result), "")
+    if not column:
         return result
+    declination = result.pop(column)
     otherwise = stated_norths(table.metadata, table.source).get("declination_deg", np.nan)
     declination = np.where(np.isnan(declination), otherwise, declination)
     result[DECLINATIONS[0]] = declination
     blank = np.flatnonzero(np.isnan(declination))
     if 0 < blank.size < declination.size:
         problem = "is blank, and no declination_deg in the metadata stands for it. Fill the cell, or state one."
-        raise cell_error(table, DECLINATIONS[0], int(blank[0]), problem)
+        raise cell_error(table, column, int(blank[0]), problem)
     return result if not blank.size else {k: v for k, v in result.items() if k != DECLINATIONS[0]}
 
 

@@ -19,6 +19,7 @@ from mwdcal.calibration.results import UNKNOWN_GRAVITY, unknown_gravity
 from mwdcal.digests import sha256_of
 from mwdcal.errors import InputError
 from mwdcal.files.contract import REFERENCES
+from mwdcal.files.formats.columns import shown
 from mwdcal.geometry.observables import EXTRAPOLATED, OBSERVABLES, RESULTS, VECTORS
 from mwdcal.geometry.units import LENGTH_UNITS, STANDARD_GRAVITY, USUAL_COURSES
 from mwdcal.geometry.vectors import AnyArray, Array, ArrayLike, Bools, Ints, diagonal, wrap
@@ -339,7 +340,7 @@ WELL_FINDINGS = {
     "calibration-later": "the surveys are of {day}, before the calibration of {calibrated}: is it the right one?",
     "long-courses": "the courses between surveys are {course:.0f} m long (median), and {usual:g} m are usual: are "
     "the depths in feet? Name their column `md_ft`, or give `length_unit`.",
-    "magnetic-north": "no declination: azimuths and the well path count from magnetic north.",
+    "magnetic-north": "no declination{unread}: azimuths and the well path count from magnetic north.",
     "path-from-first": "the well path starts at the first station, at north 0, east 0 and TVD 0. `tie_in` gives its "
     "position.",
     "path-from-later": "the well path starts at station {start}: those before it have no result or no measured depth. "
@@ -878,6 +879,7 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
     lacking = [n for n, lacks in zip(STRENGTH_NAMES, counts.lacking, strict=True) if lacks]
     walks = result.errors is not None and result.errors.by_walk
     alike = ", ".join(result.judgement.alike())
+    line = result.readings.not_taken.get("declination_deg", "")
     applies = {
         "rejected": counts.rejected,
         "rejected-alike": 2 * counts.rejected > counts.judged and alike,
@@ -903,6 +905,7 @@ def _findings(result: Well, counts: WellCounts, from_first: bool) -> list[Findin
         "count": counts.rows - counts.on_path, "years": years, "day": day, "calibrated": calibrated, "course": course,
         "usual": USUAL_COURSE, "lacking_path": LACKING_PATH[counts.located],
         "drift": OLD_DRIFT[DRIFT in result.terms.included],
+        "unread": f" ({shown(line)} is not understood: write degrees, east positive)" if line else "",
     }  # fmt: skip
     return [*result.corrected, *result.north.findings] + [
         Finding(id=name, text=text.format(**words))

@@ -61,7 +61,7 @@ from mwdcal.estimation.uncertainty import (
     station_misfit,
 )
 from mwdcal.geometry.vectors import Array, Bools, Ints, diagonal, quotient
-from mwdcal.sensor.profile import PRACTICES
+from mwdcal.sensor.profile import PRACTICES, Profile
 
 # --------------------------------------------------------------------------
 # Stations that repeat the readings of an earlier one more closely than noise allows: copies, not measurements.
@@ -246,13 +246,20 @@ def unused_columns(columns: Sequence[str]) -> list[Finding]:
     return [Finding(id=UNUSED, text=f"columns not used: {listed(columns, COLUMNS_NAMED)}.")]
 
 
+_OF_THE_EARTH = {
+    "ref_gravity_g": ", or no gravity on Earth (9.76 to 9.84 m/s²)",
+    "ref_field_nt": ", or no field on Earth (15,000 to 80,000 nT)",
+}
+"""A third reason why a line is not taken, by column of a run file."""
+
+
 def references_not_taken(lines: Mapping[str, str]) -> list[Finding]:
     """A finding on each line that may state a reference, by column of a run file, which is not stated otherwise."""
     return [
         Finding(
             id="reference-not-taken",
-            text=f"'{line}' is nominal or unclear, and not taken as '{column}', which the run does not state "
-            "otherwise. If it holds, state it plainly, or in a column.",
+            text=f"'{line}' is nominal or unclear{_OF_THE_EARTH.get(column, '')}, and not taken as '{column}', which "
+            "the run does not state otherwise. If it holds, state it plainly, or in a column.",
         )
         for column, line in lines.items()
     ]
@@ -276,17 +283,21 @@ def left_handed(axes: Mapping[str, Sequence[str]]) -> list[Finding]:
     """A finding on triads whose channels x, y, z are a left-handed set by their axes.
 
     Not on an accelerometer whose channels all read opposite to those of the magnetometer: positive upwards, as many do.
+    A magnetometer that reads so is that of a tool turned by 180° of azimuth, and named.
     """
     triads = [*compress(axes, map(is_left_handed, axes.values()))]
     if not triads:
         return []
     others = [kind for kind in axes if kind not in triads]
     opposite = [tuple(axis.translate(_OTHER_SIGN) for axis in axes[kind]) for kind in triads]
-    if others and opposite == [tuple(axes[others[0]])]:
+    reversed_whole = bool(others) and opposite == [tuple(axes[others[0]])]
+    if reversed_whole and triads == [TRIADS[0]]:
         return []
     reason = (
-        f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read roll "
-        "test and surveys with the same wiring"
+        "all azimuths of the stand are 180° off, and the dip has the wrong sign: correct both"
+        if reversed_whole
+        else f"two channels are exchanged or one is reversed, other than in the {others[0]}: correct that, or read "
+        "roll test and surveys with the same wiring"
         if others
         else "a reference angle counts the other way: toolface anticlockwise, or inclination from below"
     )
@@ -316,6 +327,16 @@ def of_table(readings: Readings) -> list[Finding]:
     known = [name for name, values in readings.known.items() if not np.isnan(values).all()]
     absent = magnetometer_absent(known) if readings.magnetometer is None else []
     return [*marked, *unread, *absent, *unused_columns(readings.unused)]
+
+
+def angles_absent(profile: Profile, readings: Readings) -> list[Finding]:
+    """A finding on a run without any angle of the stand, where the profile names columns of these."""
+    if any(not np.isnan(readings.reference(name)).all() for name in ANGLES):
+        return []
+    columns = profile.columns or {}
+    names = [f"'{columns[c].name}'" for n in ANGLES if (c := f"ref_{n}_deg") in columns]
+    text = f"the table has no angles of the stand: the tool profile's columns {listed(names, len(names))} are absent."
+    return [Finding(id="angles-absent", text=text)] if names else []
 
 
 def findings(flags: Iterable[Flag], place: int, labels: Sequence[str]) -> list[Finding]:
@@ -355,7 +376,8 @@ def finding_flags(fitted: FittedRuns) -> Iterator[Flag]:
     both = [profile.accelerometer.axes, profile.magnetometer.axes]
     axes = dict(zip(TRIADS, both[:count], strict=False))
     turned = both[:count].count(("+x", "+y", "+z")) < count
-    for each in [*(left_handed(axes) if turned else ()), *of_table(fitted.readings)]:
+    of_run = [*angles_absent(profile, fitted.readings), *of_table(fitted.readings)]
+    for each in [*(left_handed(axes) if turned else ()), *of_run]:
         yield _common(fitted, each.id, each.text, range(fitted.count))
     yield from _culprits(fitted)
     yield _distrusted(fitted)

@@ -28,9 +28,14 @@ def unidentified(serials: Mapping[str, str | None]) -> list[Finding]:
     lacking = [name for name, serial in serials.items() if serial is None]
     if not lacking:
         return []
-    unknown = "that they are of the same tool" if len(serials) > 1 else "which tool it is of"
+    every = "both" if len(serials) == 2 else f"all {len(serials)}"
+    unknown = (
+        f"cannot check that {every} are of the same tool"
+        if len(serials) > 1
+        else "does not know which tool it is of"
+    )
     text = (
-        f"no serial in {' and '.join(lacking)}: nothing shows {unknown}. State it in each run: in a line above the "
+        f"no serial in {' and '.join(lacking)}: mwdcal {unknown}. State it in each run: in a line above the "
         """names, '# serial = "MWD-17"', in a column serial, or in Python by metadata={"serial": "MWD-17"}."""
     )
     return [Finding(id=UNIDENTIFIED, text=text)]

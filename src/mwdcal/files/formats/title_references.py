@@ -235,6 +235,11 @@ _OF_SENSITIVITY = re.compile(
     rf"(?:(?:{_ROUGH.pattern})\W*)?(?:{_WRITTEN_NUMBER})\s*[(\[]?\s*{_RATIO}|{_RATIO}\W*(?:{_WRITTEN_NUMBER})?"
 )
 """A sensitivity or its inverse: 16384 LSB/g, 0.5 counts per nT, µT/V = 50."""
+_SENSITIVITY_RATIO = re.compile(
+    rf"(?<![^\W\d_])(?P<counted>{_COUNTED})\.?{_FOR_EACH}(?P<unit>{_WRITTEN_UNIT}|[gг])(?![^\W\d_])|"
+    rf"(?<![^\W\d_])(?P<per>{_WRITTEN_UNIT}){_FOR_EACH}(?P<counts>{_COUNTED})(?![^\W\d_])"
+)
+_OF_MAGNETS = re.compile(r"mag|flux|fel[dt]|field|champ|campo|маг|磁")
 _OF_ANOTHER = re.compile(
     rf"\s*(?:{_COUNTED}|-?bits?|[km]?hz|k?sps|ppm|%|m?a|[mkh]?pa|[kmc]?m|kg|k?ohm)(?![^\W\d_])|"
     r"\W*(?:fs|f\.s|full[ -]?scale|span|range)(?![^\W\d_])"
@@ -560,6 +565,40 @@ def _belong_together(
         rf"\s*(?:{_WRITTEN_UNIT})", _plain(behind["text"])
     )
     return bool(labels) or (thousands and labelled)
+
+
+class Sensitivity(NamedTuple):
+    """A scale that a line states: raw units in a g or nT, the raw unit (mV, V, or counts), and the base: g or nT."""
+
+    scale: float
+    raw: str
+    base: str
+
+
+def sensitivity_in(line: str) -> Sensitivity | None:
+    """The sensitivity of a triad that a line states, or its inverse.
+
+    >>> sensitivity_in("Nominell følsomhet magnetometer (mV/µT) 40")
+    Sensitivity(scale=0.04, raw='mV', base='nT')
+    >>> sensitivity_in("accelerometers 16384 LSB/g").scale, sensitivity_in("Field 50612 nT")
+    (16384.0, None)
+    """
+    text = _plain(line)
+    match = _SENSITIVITY_RATIO.search(text)
+    if not match:
+        return None
+    before = re.search(rf"(?P<number>{_WRITTEN_NUMBER})\s*[(\[]?\s*$", text[: match.start()])
+    number = before or re.match(rf"\W*(?P<number>{_WRITTEN_NUMBER})", text[match.end() :])
+    values = {*_numbers(number["number"])} - {0.0} if number else set()
+    quantity = _OF_PLACES[0 if _OF_MAGNETS.search(text) else 2]
+    unit = _stated_unit(quantity, match["unit"] or match["per"])
+    base = next((q.units[0] for q in _OF_PLACES[::2] if unit in q.units), "")
+    if len(values) != 1 or not base:
+        return None
+    scale = values.pop() if match["unit"] else 1 / values.pop()
+    counted = match["counted"] or match["counts"]
+    raw = "counts" if counted[-1:] not in "vв" else "mV" if len(counted) > 1 else "V"
+    return Sensitivity(scale / FACTORS.get(unit, (1.0, 0.0))[0], raw, base)
 
 
 def references_in(rows: Rows, besides: Rows = ()) -> dict[str, float]:

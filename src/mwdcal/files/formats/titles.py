@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from datetime import date, datetime
+from datetime import date, datetime, timedelta
 from typing import NamedTuple
 
 import numpy as np
@@ -213,22 +213,37 @@ _ENGLISH_DATE = re.compile(
 _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
-_SENSE = "[ew]|east|west|ouest|oeste?|vest|est|este|leste|ost|øst|öst|зап\\w*|вост\\w*"
+_WEST_WORD = r"west\w*|ouest|oeste?|ovest|vest\w*|v[äa]st\w*|зап\w*|zach\w*|z[áa]pad\w*|bat[ıi]|西"
+_SENSE = rf"[ew]|{_WEST_WORD}|east\w*|est|este|leste|ost|øst|öst|вост\w*"
+_LETTERS_OF_SENSE = (
+    (r"de[ck]linac(j|e\b)|odchyl", "e", "z"),
+    (r"miss?v|dekl|(meridian)?konv", "eoöø", "wv"),
+    (r"d[eé]clin(a[cçz]|ai)|convergencia", "el", "wo"),
+    (r"[а-я]", "eв", "wз"),
+    (r"[\u4e00-\u9fff]", "e东東", "w西"),
+    (r"manyetik", "ed", "wb"),
+    (r"", "e", "w"),
+)
+"""The letters for east and for west in the language of a word for the declination; any other is not understood.
+
+V is west in Norwegian and east in Czech, O is east in German and west in French, W is east in Polish.
+"""
 _TURN_EAST = (
     r"(?:\s+mag[^\W\d_]*)?(?:\s+(?:at|am|ved|en|in|on)\s+(?:the\s+)?[^\W\d_]+)?"
     rf"(?P<note>(?:[\s,;:]*(?:\([^)]*\)|\[[^\]]*\]|(?:deg\w*|grad\w*|gra[du][os]?s?|град\w*|гр|positive|{_SENSE})(?![^\W\d_])))*)"
-    r"[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*)?"
-    r"(?:\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*(?:['′’]|min\w*))?\s*\(?(?P<sense>[EWO](?!\s*[+(])|west|зап|vest|oest)?"
+    r"[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*|gra[du]\w*|град\w*|гр)?"
+    r"(?:\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*(?:['′’]|min\w*))?"
+    r"\s*[(\[]?(?:(?:mot|nach|to\w*|the|al?|hacia|vers)\s+)*(?P<sense>[^\W\d_]++(?!\s*[+(]|\W*\d))?"
 )
 _DECLINATION_WORD = re.compile(
-    r"((?:decl|dekl|décl)\w*|misvisning|склонени\w*|схилення|偏角|manyetik sapma|odchylenie magn\w*)",
+    r"((?:decl|dekl|décl)\w*|miss?visning|склонени\w*|схилення|偏角|manyetik sapma|odchylenie magn\w*)",
     re.IGNORECASE,
 )
 _DECLINATION = re.compile(_DECLINATION_WORD.pattern + _TURN_EAST, re.IGNORECASE)
-_WEST_POSITIVE = re.compile(r"\b(w|west|ouest|oeste?|vest|зап\w*)\b\W*(\+|pos)", re.IGNORECASE)
+_WEST_POSITIVE = re.compile(rf"\b(w|{_WEST_WORD})\b\W*(\+|pos)", re.IGNORECASE)
 """A sense in brackets behind the word: (° W +)."""
 _WEST = re.compile(
-    r"(\W*(deg\w*|grad\w*|gra[du][os]?s?))?\W*(w|west|ouest|oeste?|vest|зап\w*)(\W*(deg\w*|grad\w*|gra[du][os]?s?))?\W*",
+    rf"(\W*(deg\w*|grad\w*|gra[du][os]?s?))?\W*(w|{_WEST_WORD})(\W*(deg\w*|grad\w*|gra[du][os]?s?))?\W*",
     re.IGNORECASE,
 )
 """The whole of such words: (W), (° west), W [deg]."""
@@ -290,7 +305,7 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
             if not value or key in metadata:
                 continue
             if key == "date":
-                day = day_of(value, not _ENGLISH_DATE.match(cell))
+                day = day_of(value, not _ENGLISH_DATE.match(cell)) or _day_of_number(value)
                 unclear = unclear or ("" if day else value)
                 value = day
             if value:
@@ -336,14 +351,26 @@ def _rotation(statement: re.Pattern[str], text: str) -> float | None:
     value = math.copysign(abs(degrees) + minutes / 60, -1 if match["degrees"][0] in "-−" else 1)
     if abs(value) > 180:
         return None
-    note, sense = match["note"] or "", match["sense"] or ""
+    note, behind = match["note"] or "", match["sense"] or ""
     if _NO_DEGREES.search(note):
         return None
     if _WEST_POSITIVE.search(note):
         return -value
-    ost = sense.upper() == "O" and match[1].lower().startswith("dekl")
-    west = sense.upper()[:1] in tuple("WOЗV") or _WEST.fullmatch(note)
-    return -abs(value) if west and not ost else value
+    letters = re.findall(r"(?<![^\W_])[^\W\d_](?![^\W_])", note)
+    senses = [_sense(match[1], each) for each in (*letters, behind)]
+    if None in senses:
+        return None
+    return -abs(value) if -1 in senses or _WEST.fullmatch(note) else value
+
+
+def _sense(word: str, text: str) -> int | None:
+    """The sense of a text beside a declination that is called by a word: -1 west, else 1; None of an unknown letter."""
+    if re.fullmatch(_WEST_WORD, text, re.IGNORECASE):
+        return -1
+    if len(text) != 1:
+        return 1
+    _, east, west = next(each for each in _LETTERS_OF_SENSE if re.match(each[0], word.lower()))
+    return 1 if text.lower() in east else -1 if text.lower() in west else None
 
 
 def unread_declination(text: str) -> bool:
@@ -437,6 +464,21 @@ def day_of(text: str, day_first: bool = False) -> str:
     orders = [(one, two)] if day_first else [(two, one)] if american else [(one, two), (two, one)]
     days = {f"{match[4]}-{m:02d}-{d:02d}" for d, m in orders if 0 < m <= 12 and 0 < d <= 31}
     return days.pop() if len(days) == 1 else ""
+
+
+_DAY_NUMBERS = (36_526, 73_050)
+"""Numbers that a workbook has for the first day of 2000 and for the last of 2099."""
+
+
+def _day_of_number(text: str) -> str:
+    """The day of a number of days since 30 December 1899, as a workbook stores it; empty where it is no such number.
+
+    >>> _day_of_number("46350"), _day_of_number("2026")
+    ('2026-11-24', '')
+    """
+    days = int(text) if re.fullmatch(r"\d{5}", text) else 0
+    first, last = _DAY_NUMBERS
+    return (date(1899, 12, 30) + timedelta(days)).isoformat() if first <= days <= last else ""
 
 
 def _day_in_words(text: str) -> str:
