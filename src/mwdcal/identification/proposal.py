@@ -1742,30 +1742,24 @@ def axes_open(proposal: Proposal) -> list[Finding]:
     ]
 
 
-_TURNS_ABOUT_Z: dict[tuple[str, ...], int] = {
-    ("-x", "-y", "+z"): 180,
-    ("+y", "-x", "+z"): 90,
-    ("-y", "+x", "+z"): 90,
-}
-"""Degrees by which channels x, y, z read as turned about the tool's axis, by their axes."""
+_HALF_A_TURN = ("-x", "-y", "+z")
+"""Axes of channels x, y and z of a tool that is half a turn off about z; a quarter of a turn is a usual wiring."""
 
 
 def turned_about_z(proposal: Proposal) -> list[Finding]:
-    """A finding on triads whose channels, called x, y and z, all read as turned about z by one angle."""
+    """A finding on triads whose channels, called x, y and z, all read as turned by 180° about z."""
     columns = proposal.profile.columns or {}
-    turns = {_TURNS_ABOUT_Z.get(each.axes, 0) for each in proposal.wirings.values()}
     names = {
         c: columns[c].name if c in columns else c
         for kind in proposal.wirings
         for c in CHANNELS[kind]
     }
     plain = all(re.search(rf"(?i:{c[1]})(?![^\W\d_])", name) for c, name in names.items())
-    if len({each.axes for each in proposal.wirings.values()}) != 1 or turns == {0} or not plain:
+    if {each.axes for each in proposal.wirings.values()} != {_HALF_A_TURN} or not plain:
         return []
-    turn = turns.pop()
     text = (
-        f"the channels X and Y of {' and '.join(proposal.wirings)} read as turned by {turn}° about Z. Either the tool "
-        f"is wired so, or the toolface zero of the stand is {turn}° off (mark down?): then survey toolfaces are, too."
+        f"the channels X and Y of {' and '.join(proposal.wirings)} read as turned by 180° about Z. Either the tool "
+        "is wired so, or the toolface zero of the stand is 180° off (mark down?): then survey toolfaces are, too."
     )
     return [Finding(id="turned-about-z", text=text)]
 
