@@ -237,7 +237,12 @@ def test_azimuths_half_a_turn_off_are_a_cause_beside_the_sign_of_the_dip(tmp_pat
 
 @pytest.mark.parametrize(
     ("turn", "names", "said"),
-    [(0, NAMES, False), (180, NAMES, True), (90, NAMES, False), (180, {"ax": "Accel 1 (V)"}, False)],
+    [
+        (0, NAMES, False),
+        (180, NAMES, True),
+        (90, NAMES, False),
+        (180, {"ax": "Accel 1 (V)"}, False),
+    ],
 )
 def test_a_tool_turned_in_the_stand_is_named_where_channels_say_their_axes(
     tmp_path, turn, names, said
