@@ -305,3 +305,15 @@ def test_a_roll_test_in_repeated_rows_is_judged_by_its_means(tmp_path):
     verdict = library.verify(library.calibrate(read(run)), read(test))
     assert verdict.stations == 12
     assert "12 stations of 3 readings each" in findings_of(verdict)["marked-rows"]
+
+
+def test_labels_of_directions_without_toolfaces_are_no_stations(tmp_path):
+    """A tool rolled at 1.5° moves within 3 % of its range; rolled at 60° and 90° under one label it does not."""
+    inclination = np.repeat([1.5, 60, 90], 8) * DEG
+    toolface = np.tile(np.arange(8) * 45, 3) * DEG
+    tool = Tool.random(3)
+    g, _ = tool.clean(inclination, np.zeros(24), toolface)
+    run = dict(zip(("ax", "ay", "az"), 3.0 * g.T, strict=True))
+    run["station"] = np.repeat(["V", "S", "H"], 8)
+    run |= {"ref_inclination_deg": inclination / DEG, "temperature_c": np.full(24, 24.0)}
+    assert library.read_run(write_csv(tmp_path / "r.csv", run), profile="servo").count == 24

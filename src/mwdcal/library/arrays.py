@@ -90,7 +90,8 @@ def readings(
         station: labels, for messages and tables.
         metadata: `serial` as text, `date` as 2026-01-31, `operator`, …; `simulated` marks data of no real tool. Those
             that a run file takes for its numbers count here too: `azimuth_reference` with `declination_deg` and
-            `convergence_deg`, and `ref_gravity_g`, `ref_field_nt` and `ref_dip_deg` of all stations.
+            `convergence_deg`, and `ref_gravity_g`, `ref_field_nt` and `ref_dip_deg` of all stations. The azimuths in
+            `Readings.known` are magnetic already: give them without these keys of the north.
         md_m: measured depths, m, which `survey` needs for a well path.
         references: `inclination`, `azimuth`, `toolface`, `gravity`, `field` and `dip`, where known.
 
