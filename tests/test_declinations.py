@@ -42,6 +42,12 @@ from mwdcal.files.formats.titles import titles
         ("Склонение", "2,35 В", 2.35),
         ("磁偏角", "2.35° 西", -2.35),
         ("Declination", "2.35 F 50612 nT", 2.35),
+        ("Declination", "1.2 W 2025", -1.2),
+        ("Declination", "4.2° W, 51234 nT", -4.2),
+        ("Declination", "4.2 W (2025)", -4.2),
+        ("Declination", "4.2 deg. W 0.1/yr", -4.2),
+        ("Declination", "-4.2 (W +)", 4.2),
+        ("Manyetik sapma", "2.35 B 2025", -2.35),
     ],
 )
 def test_a_declination_is_read_behind_its_unit_and_sense(
@@ -59,6 +65,7 @@ def test_a_declination_is_read_behind_its_unit_and_sense(
         "Declination σ 0.1",
         "Declination 2.35 O",
         "Declination 2.35 V",
+        "Declination 2.35 V 2025",
         "Deklinacja 2,35 W",
         "Misvisning 2,35 N",
     ],

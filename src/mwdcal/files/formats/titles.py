@@ -231,9 +231,9 @@ V is west in Norwegian and east in Czech, O is east in German and west in French
 _TURN_EAST = (
     r"(?:\s+mag[^\W\d_]*)?(?:\s+(?:at|am|ved|en|in|on)\s+(?:the\s+)?[^\W\d_]+)?"
     rf"(?P<note>(?:[\s,;:]*(?:\([^)]*\)|\[[^\]]*\]|(?:deg\w*|grad\w*|gra[du][os]?s?|град\w*|гр|positive|{_SENSE})(?![^\W\d_])))*)"
-    r"[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*|gra[du]\w*|град\w*|гр)?"
+    r"[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*\.?|gra[du]\w*|град\w*|гр)?"
     r"(?:\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*(?:['′’]|min\w*))?"
-    r"\s*[(\[]?(?:(?:mot|nach|to\w*|the|al?|hacia|vers)\s+)*(?P<sense>[^\W\d_]++(?!\s*[+(]|\W*\d))?"
+    r"\s*[(\[]?(?:(?:mot|nach|to\w*|the|al?|hacia|vers)\s+)*(?P<sense>(?P<symbol>[BFGHI](?=\W*\d))|[^\W\d_]++)?"
 )
 _DECLINATION_WORD = re.compile(
     r"((?:decl|dekl|décl)\w*|miss?visning|склонени\w*|схилення|偏角|manyetik sapma|odchylenie magn\w*)",
@@ -241,7 +241,7 @@ _DECLINATION_WORD = re.compile(
 )
 _DECLINATION = re.compile(_DECLINATION_WORD.pattern + _TURN_EAST, re.IGNORECASE)
 _WEST_POSITIVE = re.compile(rf"\b(w|{_WEST_WORD})\b\W*(\+|pos)", re.IGNORECASE)
-"""A sense in brackets behind the word: (° W +)."""
+"""A sense that counts as positive, in brackets: (° W +)."""
 _WEST = re.compile(
     rf"(\W*(deg\w*|grad\w*|gra[du][os]?s?))?\W*(w|{_WEST_WORD})(\W*(deg\w*|grad\w*|gra[du][os]?s?))?\W*",
     re.IGNORECASE,
@@ -354,10 +354,11 @@ def _rotation(statement: re.Pattern[str], text: str) -> float | None:
     note, behind = match["note"] or "", match["sense"] or ""
     if _NO_DEGREES.search(note):
         return None
-    if _WEST_POSITIVE.search(note):
+    if _WEST_POSITIVE.search(note) or (behind and _WEST_POSITIVE.match(text, match.start("sense"))):
         return -value
     letters = re.findall(r"(?<![^\W_])[^\W\d_](?![^\W_])", note)
-    senses = [_sense(match[1], each) for each in (*letters, behind)]
+    senses = [_sense(match[1], each) for each in letters]
+    senses.append(_sense(match[1], behind) or (1 if match["symbol"] else None))
     if None in senses:
         return None
     return -abs(value) if -1 in senses or _WEST.fullmatch(note) else value
