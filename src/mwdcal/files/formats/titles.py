@@ -213,10 +213,10 @@ _ENGLISH_DATE = re.compile(
 _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
-_WEST_WORD = r"west\w*|ouest|oeste?|ovest|vest\w*|v[äa]st\w*|зап\w*|zach\w*|z[áa]pad\w*|bat[ıi]|西"
+_WEST_WORD = r"west\w*|ouest|oeste?|ovest|vest\w*|v[äa]st\w*|зап\w*|za(?:ch|hod)\w*|z[áa]pad\w*|bat[ıi]|西"
 _SENSE = rf"[ew]|{_WEST_WORD}|east\w*|est|este|leste|ost|øst|öst|вост\w*"
 _LETTERS_OF_SENSE = (
-    (r"de[ck]linac(j|e\b)|odchyl", "e", "z"),
+    (r"deklin[aáā]c|declinac(j|e\b)|odchyl", "e", "z"),
     (r"miss?v|dekl|(meridian)?konv", "eoöø", "wv"),
     (r"d[eé]clin(a[cçz]|ai)|convergencia", "el", "wo"),
     (r"[а-я]", "eв", "wз"),
@@ -226,7 +226,7 @@ _LETTERS_OF_SENSE = (
 )
 """The letters for east and for west in the language of a word for the declination; any other is not understood.
 
-V is west in Norwegian and east in Czech, O is east in German and west in French, W is east in Polish.
+V is west in Norwegian and Lithuanian, and east in Czech and Slovene, O is east in German and west in French, W is east in Polish.
 """
 _TURN_EAST = (
     r"(?:\s+mag[^\W\d_]*)?(?:\s+(?:at|am|ved|en|in|on)\s+(?:the\s+)?[^\W\d_]+)?"
