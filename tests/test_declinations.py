@@ -89,8 +89,18 @@ def test_a_declination_that_is_not_understood_is_listed(line: str) -> None:
         (["Datum:", 43890], "2020-02-29"),
         (["Date", 20261], None),
         (["Order", 46350], None),
+        (["Field (nT)", "Nominal", 50500, "Measured", 50000], None),
+        (["Data", 46350], None),
+        (["Logged: 46350"], None),
+        (["Measured", "12.03.2026"], "2026-03-12"),
     ],
 )
 def test_a_number_beside_a_word_for_the_date_is_the_day_that_a_workbook_stores(row, day) -> None:
     """Days of LibreOffice Calc: =DATE(2026;11;24) as a number is 46350."""
     assert titles([row]).metadata.get("date") == day
+
+
+def test_a_day_beside_its_label_comes_before_a_number() -> None:
+    for row in (["Field (nT)", "Nominal", 50500, "Measured", 50000], ["Datum", 50000]):
+        rows = [row, ["Date of calibration", "2026-03-12"]]
+        assert titles(rows).metadata["date"] == "2026-03-12"

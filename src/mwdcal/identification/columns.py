@@ -549,8 +549,8 @@ _LOW_SIDE = (
     r"(?:para )?baixo|(?:vers le|en) bas|in basso|w dół|na dole|вниз\w*|снизу)(?![^\W\d_])|(?:标记|刻线|键槽)[朝向]?下)"
 )
 _HIGH_SIDE = (
-    r"(?:high[- ]?side|h[øo]yside|h[öo]gside|oberseite|hochseite|hoge zijde|bovenzijde|lado (?:de )?(?:arriba|alto|cima)|"
-    r"c[oô]t[eé] haut|lato alto|верхн\w+ сторон|верхн\w+ стенк|g[óo]rn\w+ stron|高边|上侧)"
+    r"(?:high[- ]?side|h[øo]yside|h[öo]gside|oberseite|hochseite|hoge zijde|bovenzijde|lado (?:de )?alto|"
+    r"lado (?:de )?(?:arriba|cima)|c[oô]t[eé] haut|lato alto|верхн\w+ сторон|верхн\w+ стенк|g[óo]rn\w+ stron|高边|上侧)"
 )
 _FROM_LOW = re.compile(
     rf"(?:^|[,;.])(?:(?!{_HIGH_SIDE})[^,;.])*?"

@@ -44,6 +44,8 @@ _TITLE_WORDS = {
     "utfortav оператор исполнитель 操作员 检定员",
     "lab": "lab laboratory labor laboratorium laboratorio лаборатория 实验室",
 }
+_OF_READINGS = ("measured", "logged", "data")
+"""Words of a date that have a number of another quantity behind them as well."""
 _DAYS = (
     "%Y-%m-%d",
     "%Y/%m/%d",
@@ -213,7 +215,9 @@ _ENGLISH_DATE = re.compile(
 _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
-_WEST_WORD = r"west\w*|ouest|oeste?|ovest|vest\w*|v[äa]st\w*|зап\w*|za(?:ch|hod)\w*|z[áa]pad\w*|bat[ıi]|西"
+_WEST_WORD = (
+    r"west\w*|ouest|oeste?|ovest|vest\w*|v[äa]st\w*|зап\w*|za(?:ch|hod)\w*|z[áa]pad\w*|bat[ıi]|西"
+)
 _SENSE = rf"[ew]|{_WEST_WORD}|east\w*|est|este|leste|ost|øst|öst|вост\w*"
 _LETTERS_OF_SENSE = (
     (r"deklin[aáā]c|declinac(j|e\b)|odchyl", "e", "z"),
@@ -226,7 +230,8 @@ _LETTERS_OF_SENSE = (
 )
 """The letters for east and for west in the language of a word for the declination; any other is not understood.
 
-V is west in Norwegian and Lithuanian, and east in Czech and Slovene, O is east in German and west in French, W is east in Polish.
+V is west in Norwegian and Lithuanian, and east in Czech and Slovene.
+O is east in German and west in French, W is east in Polish.
 """
 _TURN_EAST = (
     r"(?:\s+mag[^\W\d_]*)?(?:\s+(?:at|am|ved|en|in|on)\s+(?:the\s+)?[^\W\d_]+)?"
@@ -305,14 +310,15 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
             if not value or key in metadata:
                 continue
             if key == "date":
-                day = day_of(value, not _ENGLISH_DATE.match(cell)) or _day_of_number(value)
+                day = day_of(value, not _ENGLISH_DATE.match(cell))
                 unclear = unclear or ("" if day else value)
                 value = day
             if value:
                 metadata[key] = value
-    for key, others in (("serial", tools), ("date", days)):
-        if key not in metadata and len(others) == 1 and not (key == "date" and unclear):
-            metadata[key] = next(iter(others))
+    lone = filter(None, [_day_of_number(unclear)]) if unclear else days
+    for key, others in (("serial", [*tools]), ("date", [*lone])):
+        if key not in metadata and len(others) == 1:
+            metadata[key] = others[0]
     if declination is not None:
         metadata |= {"declination_deg": declination} | (
             {"azimuth_reference": "true"} if true else {}
@@ -432,9 +438,10 @@ def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
     key = key or ("serial" if "serial" in inside and not _OF_EQUIPMENT.search(head) else "")
     if not key:
         return "", ""
-    return key, "".join(tail).strip(' "') or next(
+    value = "".join(tail).strip(' "') or next(
         (each.lstrip(":= ") for each in right[:3] if each), ""
     )
+    return ("", "") if word in _OF_READINGS and looks_numeric(value) else (key, value)
 
 
 def _word(text: str) -> str:
