@@ -44,7 +44,7 @@ _TITLE_WORDS = {
     "utfortav оператор исполнитель 操作员 检定员",
     "lab": "lab laboratory labor laboratorium laboratorio лаборатория 实验室",
 }
-_OF_READINGS = ("measured", "logged", "data")
+_NUMBERS_BEHIND = ("measured", "logged", "data")
 """Words of a date that have a number of another quantity behind them as well."""
 _DAYS = (
     "%Y-%m-%d",
@@ -441,7 +441,7 @@ def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
     value = "".join(tail).strip(' "') or next(
         (each.lstrip(":= ") for each in right[:3] if each), ""
     )
-    return ("", "") if word in _OF_READINGS and looks_numeric(value) else (key, value)
+    return ("", "") if word in _NUMBERS_BEHIND and looks_numeric(value) else (key, value)
 
 
 def _word(text: str) -> str:
