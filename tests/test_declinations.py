@@ -38,10 +38,18 @@ from mwdcal.files.formats.titles import titles
         ("Declinación", "2,35 O", -2.35),
         ("Declinação", "2,35 L", 2.35),
         ("Deklinace", "2,35 Z", -2.35),
+        ("Deklinácia", "2,35 Z", -2.35),
+        ("Deklinacija", "2,35 zahod", -2.35),
         ("Склонение", "2,35 З", -2.35),
         ("Склонение", "2,35 В", 2.35),
         ("磁偏角", "2.35° 西", -2.35),
         ("Declination", "2.35 F 50612 nT", 2.35),
+        ("Declination", "1.2 W 2025", -1.2),
+        ("Declination", "4.2° W, 51234 nT", -4.2),
+        ("Declination", "4.2 W (2025)", -4.2),
+        ("Declination", "4.2 deg. W 0.1/yr", -4.2),
+        ("Declination", "-4.2 (W +)", 4.2),
+        ("Manyetik sapma", "2.35 B 2025", -2.35),
     ],
 )
 def test_a_declination_is_read_behind_its_unit_and_sense(
@@ -59,6 +67,9 @@ def test_a_declination_is_read_behind_its_unit_and_sense(
         "Declination σ 0.1",
         "Declination 2.35 O",
         "Declination 2.35 V",
+        "Declination 2.35 V 2025",
+        "Deklinácia 5 V",
+        "Deklinacija 4.2 V",
         "Deklinacja 2,35 W",
         "Misvisning 2,35 N",
     ],
@@ -78,8 +89,18 @@ def test_a_declination_that_is_not_understood_is_listed(line: str) -> None:
         (["Datum:", 43890], "2020-02-29"),
         (["Date", 20261], None),
         (["Order", 46350], None),
+        (["Field (nT)", "Nominal", 50500, "Measured", 50000], None),
+        (["Data", 46350], None),
+        (["Logged: 46350"], None),
+        (["Measured", "12.03.2026"], "2026-03-12"),
     ],
 )
 def test_a_number_beside_a_word_for_the_date_is_the_day_that_a_workbook_stores(row, day) -> None:
     """Days of LibreOffice Calc: =DATE(2026;11;24) as a number is 46350."""
     assert titles([row]).metadata.get("date") == day
+
+
+def test_a_day_beside_its_label_comes_before_a_number() -> None:
+    for row in (["Field (nT)", "Nominal", 50500, "Measured", 50000], ["Datum", 50000]):
+        rows = [row, ["Date of calibration", "2026-03-12"]]
+        assert titles(rows).metadata["date"] == "2026-03-12"

@@ -307,6 +307,19 @@ def test_a_roll_test_above_or_beside_the_run_is_known_by_the_title_of_its_block(
 
 
 @pytest.mark.parametrize(
+    ("stated", "day"), [([["Date", "2026-03-13"]], "2026-03-13"), ([], "2024-03-12")]
+)
+def test_the_day_of_the_calibration_in_the_title_of_a_roll_test_is_not_its_own(
+    tmp_path: Path, stated: list[list[object]], day: str
+) -> None:
+    """The title's day holds only where the block states none."""
+    title = ["Roll test of calibration 12.03.2024"]
+    path = written(tmp_path / "w.xlsx", [title, *stated, TITLES, *ROLLS])
+    (table,) = tables.every_table(path)
+    assert table.titles.metadata["date"] == day
+
+
+@pytest.mark.parametrize(
     "line", ["Roll test 13.03.2026", "Check due 13.03.2026", "Verified 13.03.2026"]
 )
 def test_the_day_behind_a_title_is_that_of_a_roll_test_only(tmp_path: Path, line: str) -> None:

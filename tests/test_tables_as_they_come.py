@@ -176,6 +176,9 @@ def test_two_serials_on_two_sheets_are_asked_about(tmp_path):
         library.propose_profile(path)
     assert library.propose_profile(path, serial="AK-4471").profile.name == "AK-4471"
     assert "'AK-4417' is taken unless" in " ".join(read(path, serial="AK-4471").remarks)
+    book["Sheet"]["B1"] = "AK-441"
+    book.save(path)
+    assert "'AK-4417' is taken unless" in " ".join(read(path, serial="AK-4417").remarks)
     book["Sheet"]["B1"] = "SN ak 4417"
     book.save(path)
     assert not any("another sheet" in each for each in read(path).remarks)

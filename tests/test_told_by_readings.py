@@ -1116,7 +1116,8 @@ def test_the_serial_stands_behind_the_word_for_the_tool_in_indonesian_and_turkis
 LOW_SIDES = (
     "Rullvinkel: 0 når merket peker NED (lavside)", "Toolface zero = low side", "TF 0 with the scribe down",
     "Rollwinkel ab Tiefseite gezählt", "Toolface: cero con la marca hacia abajo", "Toolface: lado baixo = 0",
-    "Toolface 0: repère en bas", "Угол установки отклонителя: 0, когда метка внизу", "工具面角：从低边算起",
+    "Toolface 0: repère en bas", "High side = 180, toolface zero at low side", "Toolface high side = 180, low side = 0",
+    "Угол установки отклонителя: 0, когда метка внизу", "工具面角：从低边算起",
 )  # fmt: skip
 
 
@@ -1135,6 +1136,8 @@ def test_a_toolface_that_counts_from_the_low_side_by_a_line(tmp_path, line, turn
     "line",
     [
         "Toolface 0 at high side, 180 at low side", "Roll 0 = ritslijn boven", "TF from high side",
+        "Toolface counted from high side clockwise towards low side", "Toolface zero at high side (not low side)",
+        "Rollwinkel von Oberseite über rechts zur Unterseite",
         "Low side of the stand repaired 2023", "Toolface 180 = mark down",
     ],
 )  # fmt: skip

@@ -548,13 +548,21 @@ _LOW_SIDE = (
     r"(?<![^\W\d_])(?:down(?:wards?)?|at (?:the )?bottom|unten|ned(?:over)?|nere?|nedåt|onder|beneden|(?:hacia )?abajo|"
     r"(?:para )?baixo|(?:vers le|en) bas|in basso|w dół|na dole|вниз\w*|снизу)(?![^\W\d_])|(?:标记|刻线|键槽)[朝向]?下)"
 )
+_HIGH_SIDE = (
+    r"(?:high[- ]?side|h[øo]yside|h[öo]gside|oberseite|hochseite|hoge zijde|bovenzijde|lado (?:de )?alto|"
+    r"lado (?:de )?(?:arriba|cima)|c[oô]t[eé] haut|lato alto|верхн\w+ сторон|верхн\w+ стенк|g[óo]rn\w+ stron|高边|上侧)"
+)
 _FROM_LOW = re.compile(
+    rf"(?:^|[,;.])(?:(?!{_HIGH_SIDE})[^,;.])*?"
     rf"(?:{_ZERO}|(?<![^\W\d_])(?:from|von|ab|desde|a partir d[eo]|fra|från|depuis|vanaf|dal?|от|od)(?![^\W\d_])|从|自)"
-    rf"(?:[^\d,;.]|,(?=\s*(?:wenn|когда|если|коли|da|gdy)\b)){{0,30}}?{_LOW_SIDE}|"
+    rf"(?:(?!{_HIGH_SIDE})[^\d,;.]|,(?=\s*(?:wenn|когда|если|коли|da|gdy)\b)){{0,30}}?{_LOW_SIDE}|"
     rf"{_LOW_SIDE}\s*[)\]]?\s*(?:[=:：]|is|at|bei|ist|ved|en|is op|为)\s*{_ZERO}",
     re.IGNORECASE,
 )
-"""Words of toolfaces that count from the low side, or that are zero where the mark of the tool is down."""
+"""Words of toolfaces that count from the low side, or that are zero where the mark of the tool is down.
+
+Behind words for the high side they say where the angle goes, and not where it begins.
+"""
 _UPHOLE = re.compile(
     r"look\w* up|up ?hole|from (the )?(below|bottom)|von unten|nedenfra|desde abajo|visto de baixo|d'en bas|du bas|"
     r"z dołu|od dołu|снизу|向上看|从下",

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import groupby, pairwise, takewhile, zip_longest
+from itertools import combinations, groupby, pairwise, takewhile, zip_longest
 from operator import eq
 from typing import Any, NamedTuple
 
@@ -713,9 +713,15 @@ def _with_covers(layout: Layout, covers: Sequence[Sheet]) -> Layout:
 
 
 def _is_same_serial(one: str, other: str) -> bool:
-    """Whether two serials are one, but for signs, capitals and text around it."""
-    bare = [re.sub(r"[\W_]", "", each.casefold()) for each in (one, other)]
-    return bare[0] in bare[1] or bare[1] in bare[0]
+    """Whether two serials are one, but for signs, capitals and whole words or numbers around it.
+
+    >>> [_is_same_serial("MWD-17", each) for each in ("mwd 17", "MWD17", "BHX / 17", "MWD-1", "17")]
+    [True, True, False, False, True]
+    """
+    words = [re.findall(r"[^\W_]+", each.casefold()) for each in (one, other)]
+    places = [combinations(range(len(each) + 1), 2) for each in words]
+    parts = [{"".join(w[i:k]) for i, k in p} for w, p in zip(words, places, strict=True)]
+    return "".join(words[0]) in parts[1] or "".join(words[1]) in parts[0]
 
 
 def _completed(block: Titles, others: Iterable[Titles]) -> Titles:
@@ -1366,7 +1372,8 @@ def _titles_of(span: _Span, columns: Sequence[Cells], others: Block) -> Titles:
     following = span.next_block if _facts(span.next_block) else []
     apart = {line for line, _ in following}
     stated = stated_above(first, _beside(columns, [row for row in others if row[0] not in apart]))
-    if day := _day_of_check(_title(span.blocks[0])):
+    day, alone = _day_of_check(_title(span.blocks[0]))
+    if day and (alone or "date" not in stated.metadata):
         stated = stated._replace(metadata={**stated.metadata, "date": day}, unclear_day="")
     every = [*map(stated_above, above)]
     if stated.unclear_day or "serial" in stated.metadata:
@@ -1456,14 +1463,16 @@ def _is_of_check(line: str) -> bool:
     return bool(OF_CHECKS.match(line) and not _OF_ENTRY.search(line))
 
 
-def _day_of_check(title: str) -> str:
-    """The day behind the title of a check, in ISO form; empty without one.
+def _day_of_check(title: str) -> tuple[str, bool]:
+    """The day behind the title of a check, in ISO form, or empty; and whether nothing stands between them.
 
     >>> _day_of_check("Roll test 13.03.2026"), _day_of_check("Check due 13.03.2026")
-    ('2026-03-13', '')
+    (('2026-03-13', True), ('', False))
     """
     words = re.sub(r"[(),;]", " ", title).split() if _is_of_check(title) else []
-    return next(filter(None, (day_of(" ".join(words[k:])) for k in range(1, len(words)))), "")
+    places = (k for k in range(1, len(words)) if day_of(" ".join(words[k:])))
+    k = next(places, len(words))
+    return day_of(" ".join(words[k:])), bool(OF_CHECKS.fullmatch(" ".join(words[:k]).rstrip(" –-")))
 
 
 def _line(row: Cells) -> str:

@@ -44,6 +44,8 @@ _TITLE_WORDS = {
     "utfortav оператор исполнитель 操作员 检定员",
     "lab": "lab laboratory labor laboratorium laboratorio лаборатория 实验室",
 }
+_NUMBERS_BEHIND = ("measured", "logged", "data")
+"""Words of a date that have a number of another quantity behind them as well."""
 _DAYS = (
     "%Y-%m-%d",
     "%Y/%m/%d",
@@ -213,10 +215,12 @@ _ENGLISH_DATE = re.compile(
 _TRUE_NORTH = re.compile(
     r"true\s+north|geographic north|nord géographique|rechtweisend", re.IGNORECASE
 )
-_WEST_WORD = r"west\w*|ouest|oeste?|ovest|vest\w*|v[äa]st\w*|зап\w*|zach\w*|z[áa]pad\w*|bat[ıi]|西"
+_WEST_WORD = (
+    r"west\w*|ouest|oeste?|ovest|vest\w*|v[äa]st\w*|зап\w*|za(?:ch|hod)\w*|z[áa]pad\w*|bat[ıi]|西"
+)
 _SENSE = rf"[ew]|{_WEST_WORD}|east\w*|est|este|leste|ost|øst|öst|вост\w*"
 _LETTERS_OF_SENSE = (
-    (r"de[ck]linac(j|e\b)|odchyl", "e", "z"),
+    (r"deklin[aáā]c|declinac(j|e\b)|odchyl", "e", "z"),
     (r"miss?v|dekl|(meridian)?konv", "eoöø", "wv"),
     (r"d[eé]clin(a[cçz]|ai)|convergencia", "el", "wo"),
     (r"[а-я]", "eв", "wз"),
@@ -226,14 +230,15 @@ _LETTERS_OF_SENSE = (
 )
 """The letters for east and for west in the language of a word for the declination; any other is not understood.
 
-V is west in Norwegian and east in Czech, O is east in German and west in French, W is east in Polish.
+V is west in Norwegian and Lithuanian, and east in Czech and Slovene.
+O is east in German and west in French, W is east in Polish.
 """
 _TURN_EAST = (
     r"(?:\s+mag[^\W\d_]*)?(?:\s+(?:at|am|ved|en|in|on)\s+(?:the\s+)?[^\W\d_]+)?"
     rf"(?P<note>(?:[\s,;:]*(?:\([^)]*\)|\[[^\]]*\]|(?:deg\w*|grad\w*|gra[du][os]?s?|град\w*|гр|positive|{_SENSE})(?![^\W\d_])))*)"
-    r"[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*|gra[du]\w*|град\w*|гр)?"
+    r"[^\w+−-]*(?P<degrees>[+−-]?\d+[.,]?\d*)\s*(?:°|deg\w*\.?|gra[du]\w*|град\w*|гр)?"
     r"(?:\s*(?P<minutes>\d+(?:[.,]\d+)?)\s*(?:['′’]|min\w*))?"
-    r"\s*[(\[]?(?:(?:mot|nach|to\w*|the|al?|hacia|vers)\s+)*(?P<sense>[^\W\d_]++(?!\s*[+(]|\W*\d))?"
+    r"\s*[(\[]?(?:(?:mot|nach|to\w*|the|al?|hacia|vers)\s+)*(?P<sense>(?P<symbol>[BFGHI](?=\W*\d))|[^\W\d_]++)?"
 )
 _DECLINATION_WORD = re.compile(
     r"((?:decl|dekl|décl)\w*|miss?visning|склонени\w*|схилення|偏角|manyetik sapma|odchylenie magn\w*)",
@@ -241,7 +246,7 @@ _DECLINATION_WORD = re.compile(
 )
 _DECLINATION = re.compile(_DECLINATION_WORD.pattern + _TURN_EAST, re.IGNORECASE)
 _WEST_POSITIVE = re.compile(rf"\b(w|{_WEST_WORD})\b\W*(\+|pos)", re.IGNORECASE)
-"""A sense in brackets behind the word: (° W +)."""
+"""A sense that counts as positive, in brackets: (° W +)."""
 _WEST = re.compile(
     rf"(\W*(deg\w*|grad\w*|gra[du][os]?s?))?\W*(w|{_WEST_WORD})(\W*(deg\w*|grad\w*|gra[du][os]?s?))?\W*",
     re.IGNORECASE,
@@ -305,14 +310,15 @@ def titles(rows: Sequence[Sequence[object]]) -> Titles:
             if not value or key in metadata:
                 continue
             if key == "date":
-                day = day_of(value, not _ENGLISH_DATE.match(cell)) or _day_of_number(value)
+                day = day_of(value, not _ENGLISH_DATE.match(cell))
                 unclear = unclear or ("" if day else value)
                 value = day
             if value:
                 metadata[key] = value
-    for key, others in (("serial", tools), ("date", days)):
-        if key not in metadata and len(others) == 1 and not (key == "date" and unclear):
-            metadata[key] = next(iter(others))
+    lone = filter(None, [_day_of_number(unclear)]) if unclear else days
+    for key, others in (("serial", [*tools]), ("date", [*lone])):
+        if key not in metadata and len(others) == 1:
+            metadata[key] = others[0]
     if declination is not None:
         metadata |= {"declination_deg": declination} | (
             {"azimuth_reference": "true"} if true else {}
@@ -354,10 +360,11 @@ def _rotation(statement: re.Pattern[str], text: str) -> float | None:
     note, behind = match["note"] or "", match["sense"] or ""
     if _NO_DEGREES.search(note):
         return None
-    if _WEST_POSITIVE.search(note):
+    if _WEST_POSITIVE.search(note) or (behind and _WEST_POSITIVE.match(text, match.start("sense"))):
         return -value
     letters = re.findall(r"(?<![^\W_])[^\W\d_](?![^\W_])", note)
-    senses = [_sense(match[1], each) for each in (*letters, behind)]
+    senses = [_sense(match[1], each) for each in letters]
+    senses.append(_sense(match[1], behind) or (1 if match["symbol"] else None))
     if None in senses:
         return None
     return -abs(value) if -1 in senses or _WEST.fullmatch(note) else value
@@ -431,9 +438,10 @@ def _pair(cell: str, right: Sequence[str]) -> tuple[str, str]:
     key = key or ("serial" if "serial" in inside and not _OF_EQUIPMENT.search(head) else "")
     if not key:
         return "", ""
-    return key, "".join(tail).strip(' "') or next(
+    value = "".join(tail).strip(' "') or next(
         (each.lstrip(":= ") for each in right[:3] if each), ""
     )
+    return ("", "") if word in _NUMBERS_BEHIND and looks_numeric(value) else (key, value)
 
 
 def _word(text: str) -> str:
