@@ -104,6 +104,10 @@ def test_a_signed_certificate_replaces_nothing_that_it_lists_wherever_it_is(fold
         ("calibrate", "e.json.csv", "e.json.json"),
         ("convert", "e.jsn", "e.json"),
         ("sign", "e.jsn", "e.json"),
+        *(
+            ("calibrate", f"e.v2.{x}", "e.v2.json")
+            for x in ("josn", "tml", "cvs", "htm", "xls", "tonl")
+        ),
         ("report", "e.hmtl", "e.html"),
     ],
 )
@@ -113,7 +117,9 @@ def test_a_misspelt_suffix_is_refused_with_the_right_one(folder, tmp_path, comma
     assert not [*tmp_path.iterdir()]
 
 
-@pytest.mark.parametrize("name", ["e", "e.JSON", "e.json.new", "MWD 1.5"])
+@pytest.mark.parametrize(
+    "name", ["e", "e.JSON", "e.json.new", "MWD 1.5", "e.v2", "e_SN.A12", "e.new"]
+)
 def test_a_name_without_another_suffix_is_written(folder, tmp_path, name):
     assert mwdcal(*commands(folder, tmp_path / name)["calibrate"]).code == 0
     assert (tmp_path / name).exists()

@@ -406,6 +406,16 @@ def test_metadata_is_escaped(words):
     assert "&lt;script&gt;" in page
 
 
+def test_option_names_are_put_into_findings_and_into_no_text_of_the_user(words):
+    said = Finding(id="x", text="Use `order` auto")
+    record = calibrated(serial="X1 `date`", operator="`order`")
+    page = words(msgspec.structs.replace(record, findings=[*record.findings, said]))
+    assert "X1 `date`" in page
+    assert "X1 &#39;date&#39;" not in page
+    assert "<dd>`order`" in page
+    assert "Use &#39;order&#39; auto" in page
+
+
 def test_station_labels_may_be_anything(whole):
     rows = [
         msgspec.structs.replace(r, station=s)

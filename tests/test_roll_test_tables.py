@@ -343,5 +343,8 @@ def test_a_roll_test_without_a_serial_of_its_own_is_said_to_have_none(
         "--rolltest", path, "--json",
     )  # fmt: skip
     assert ran.code == 0, ran.err
-    found = {f["id"] for f in [*ran.json["findings"], *ran.json["verification"]["findings"]]}
-    assert ("no-serial" in found) is said
+    findings = [*ran.json["findings"], *ran.json["verification"]["findings"]]
+    found = [f["text"] for f in findings if f["id"] == "no-serial"]
+    assert [f.partition(": ")[0] for f in found] == [
+        "no serial in run.xlsx, sheet 'Rulletest'"
+    ] * said

@@ -226,7 +226,7 @@ class Records:
 def _doubts(choice: Choice, prior: PriorInformation | None) -> list[Finding]:
     """Findings on the identity of a run and its prior, on its day, and on standards that were overdue then."""
     readings = choice.readings
-    alone = unidentified({readings.name: serial_of(readings.metadata)})
+    alone = unidentified({readings.run_name: serial_of(readings.metadata)})
     doubts = [*prior.doubts] if prior and prior.doubts else alone
     late = overdue(choice.profile.standards, readings.metadata)
     return doubts + dated(readings.metadata, readings.name) + late

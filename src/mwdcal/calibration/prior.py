@@ -172,7 +172,7 @@ def for_run(previous: Calibration, readings: Readings) -> PriorInformation:
         )
     alone = readings.magnetometer is None
     known = from_calibration(previous, previous.relative if alone else readings.relative)
-    serials = {where: serial_of(previous.tool), readings.name: serial_of(readings.metadata)}
+    serials = {where: serial_of(previous.tool), readings.run_name: serial_of(readings.metadata)}
     known = replace(known, doubts=tuple(unidentified(serials)))
     if not alone or not previous.has_field:
         return known

@@ -218,6 +218,11 @@ class Readings:
         return self.source or "the readings"
 
     @property
+    def run_name(self) -> str:
+        """The name, with that of the sheet of a workbook, where another sheet may state otherwise."""
+        return f"{self.name}, sheet '{self.sheet}'" if self.sheet else self.name
+
+    @property
     def triads(self) -> tuple[str, ...]:
         """The triads that were read, of `TRIADS`."""
         return TRIADS[: 1 if self.magnetometer is None else 2]

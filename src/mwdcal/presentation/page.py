@@ -223,7 +223,7 @@ def environment() -> Environment:
         loader=loader,
         autoescape=True,
         undefined=StrictUndefined,
-        finalize=lambda shown: escape_controls(on_page(shown)) if type(shown) is str else shown,
+        finalize=lambda shown: escape_controls(shown) if type(shown) is str else shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -259,6 +259,6 @@ def css(text: str) -> str:
 
 FILTERS = (
     number, quantity, signed, fixed, measured, uncertainty, contribution, root_sum_of_squares, unit,
-    raised, chance, plural, capital, css,
+    raised, chance, plural, capital, css, on_page,
 )  # fmt: skip
 """The functions that the templates call."""

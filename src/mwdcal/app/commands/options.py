@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import datetime
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -394,17 +395,24 @@ KNOWN_SUFFIXES = (
     ".json", ".toml", ".html", ".htm", ".pdf", ".png", ".svg", ".csv", ".tsv", ".xlsx", ".xls", ".ods", ".parquet",
 )  # fmt: skip
 """Suffixes that say what a file holds."""
+LIKENESS = 0.75
+"""Share of letters in common, as of jsn or hmtl, from which a suffix is one of these, misspelt."""
 
 
 def _check_forms(paths: Iterable[Path | None], form: str) -> None:
-    """Refuse the suffix of another form than what is written, known or misspelt; behind its own, .new may stand."""
+    """Refuse the suffix of another form than what is written, known or misspelt; any other is part of the name."""
     for path in filter(None, paths if form else ()):
-        *before, suffix = ["", *(each.lower() for each in path.suffixes)]
-        names_form = suffix.startswith(form[:4]) and suffix in KNOWN_SUFFIXES
-        stands_behind = form in before and suffix not in KNOWN_SUFFIXES
-        if suffix[1:2].isalpha() and not (names_form or stands_behind):
+        suffix = path.suffix.lower()
+        names_form = suffix in KNOWN_SUFFIXES and suffix.startswith(form[:4])
+        spellings = map(_letters, KNOWN_SUFFIXES)
+        if not names_form and get_close_matches(_letters(suffix), spellings, cutoff=LIKENESS):
             why = f"it would hold {form[1:].upper()}, and its suffix says otherwise"
             raise _refused(path, why, path.with_suffix(form))
+
+
+def _letters(suffix: str) -> str:
+    """The letters of a suffix in the order of the alphabet: an exchange of two changes nothing."""
+    return "".join(sorted(suffix[1:]))
 
 
 def _refused(path: Path, why: str, better: Path | None = None) -> InputError:

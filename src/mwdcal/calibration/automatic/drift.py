@@ -76,7 +76,8 @@ def chances(result: Fit) -> tuple[Array, Bools, Bools]:
 
     The least of those of the walks that act on a triad, times their number; whether a trend would not show (B, t), and
     whether trends can be fitted (B, t). That of a trend counts where little of it would show, if it is below
-    `TREND_CHANCE`, or `LOST_CHANCE` of one that is as good as lost.
+    `TREND_CHANCE`, or `LOST_CHANCE` of one that is as good as lost. The trends of a triad are fitted all or none: where
+    field and offsets both drift, 95 % intervals then hold 93 %, and 67 % with the trend of the field alone.
     """
     analysis = result.analysis
     least, hidden = np.ones(analysis.freedom.shape), np.zeros(analysis.freedom.shape, bool)

@@ -90,6 +90,6 @@ def doubts(calibration: Calibration, readings: Readings) -> list[Finding]:
     """Findings on the identity of readings beside a calibration, and on their day."""
     serials = {
         "the calibration": serial_of(calibration.tool),
-        readings.name: serial_of(readings.metadata),
+        readings.run_name: serial_of(readings.metadata),
     }
     return unidentified(serials) + dated(readings.metadata, readings.name)
