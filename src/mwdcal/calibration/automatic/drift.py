@@ -265,9 +265,10 @@ def with_drifts(fits: Iterable[tuple[Ints, Fit]], options: Options) -> Iterator[
 def _with_possible_drift(
     result: Fit, options: Options, triads: Bools, wrong: bool
 ) -> Iterator[tuple[Ints, Fit]]:
-    """Places and fits with walks, then those of fits whose walks would be larger than any drift, without them."""
+    """Places and fits with walks, then those without whose walks would be larger than any drift, or not finite."""
     walking = with_drift(result, options, triads, wrong)
-    possible = _is_possible(walking)
+    before, after = (np.isfinite(r.analysis.variance_factor) for r in (result, walking))
+    possible = _is_possible(walking) & (after | ~before).all(-1)
     if possible.all():
         yield np.arange(len(possible)), walking
         return
