@@ -10,7 +10,7 @@ import mwdcal
 from cli_support import EXAMPLE
 
 PACKAGE = Path(mwdcal.__file__).parent
-MODULES, FUNCTIONS, FOLDERS = 64, 780, 15
+MODULES, FUNCTIONS, FOLDERS = 64, 792, 15
 TRACED = """
 import inspect
 import sys

@@ -130,7 +130,14 @@ def test_a_tool_that_was_not_rolled_cannot_pass(record, toolfaces, known):
         test = roll(45, seed, tool=knocked(), toolfaces=toolfaces)
         group = np.zeros(len(toolfaces), int) if known.startswith("group") else None
         kept = {k: v for k, v in test.known.items() if k in KNOWN[known]}
-        result = verify(record, msgspec_replace(test, known=kept, group=group), BOTH)
+        test = msgspec_replace(test, known=kept, group=group)
+        if known == "nothing":  # it does not even say that it is a roll test
+            with pytest.raises(
+                InputError, match=r"is no roll test.* leave a gap of .*Add toolfaces there"
+            ):
+                verify(record, test, BOTH)
+            continue
+        result = verify(record, test, BOTH)
         assert not result.passed
         for row in result.rows:
             assert not row.passed

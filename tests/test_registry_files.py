@@ -373,7 +373,7 @@ def test_a_table_of_a_fleet_without_records_is_not_taken_for_a_run(example, tmp_
     ran = mwdcal("registry", "--registry", path, "add", table)
     assert ran.code == 2
     assert "no column 'calibration'" in ran.err
-    assert "`records`" in ran.err
+    assert "--records" in ran.err
 
 
 def test_a_laboratory_whose_people_have_no_name_is_not_added(tmp_path):

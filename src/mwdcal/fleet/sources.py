@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -319,14 +320,16 @@ def _has_repeats(file: Path) -> bool:
         names = {*opened.schema_arrow.names}
         if not {_LABEL, "ax"} <= names or opened.metadata.num_rows > runs.MOST_ROWS:
             return False
-        columns = opened.read([_LABEL, *{SERIAL} & names]).combine_chunks()
-    same = True
-    for column in columns.columns:
-        cells = column.cast(cell_type(column.type))
-        same = compute.and_(same, compute.equal(cells[1:], cells[:-1]))
-        if arrow.types.is_string(cells.type) or arrow.types.is_large_string(cells.type):
-            same = compute.and_(same, compute.not_equal(cells[1:], ""))
-    return compute.any(same).as_py() is True
+        with suppress(arrow.ArrowException):  # of cells that are refused where they are read
+            same = True
+            for column in opened.read([_LABEL, *{SERIAL} & names]).combine_chunks().columns:
+                column.validate(full=True)
+                cells = column.cast(cell_type(column.type))
+                same = compute.and_(same, compute.equal(cells[1:], cells[:-1]))
+                if arrow.types.is_string(cells.type) or arrow.types.is_large_string(cells.type):
+                    same = compute.and_(same, compute.not_equal(cells[1:], ""))
+            return compute.any(same).as_py() is True
+    return False
 
 
 def _look_at_runs(file: Path, root: Path, profile: Profile) -> _File:

@@ -538,8 +538,10 @@ _CCW = re.compile(
 )
 """Words of angles that count anticlockwise."""
 _OF_TOOLFACE = re.compile(r"toolface|\broll?\b|\broll|\btf\b|angle de rotation", re.IGNORECASE)
-_ZERO = r"(?:(?<![\d.,])0(?:[.,]0+)?\s*(?:°|deg\w*|gra[du]\w*)?(?![\d.,]*\d)|zero|null(?:punkt)?|cero|ноль|нуль|零)"
-_LOW_SIDE = (
+_ZERO = re.compile(
+    r"(?:(?<![\d.,])0(?:[.,]0+)?\s*(?:°|deg\w*|gra[du]\w*)?(?![\d.,]*\d)|zero|null(?:punkt)?|cero|ноль|нуль|零)"
+).pattern
+_LOW_SIDE = re.compile(
     r"(?:low[- ]?side|lavside\w*|l[aå]gside\w*|tiefseite|unterseite|lage zijde|onderzijde|"
     r"lado (?:de )?(?:abajo|bajo|baixo)|c[oô]t[eé] bas|lato (?:basso|inferiore)|"
     r"нижн\w+ сторон\w+|нижн\w+ стенк\w+|doln\w+ stron\w+|低边|下侧|"
@@ -547,11 +549,11 @@ _LOW_SIDE = (
     r"tacca|ritslijn|merkteken|znak|ryska|риск\w*|метк\w*|标记|刻线|键槽)(?: line)?[^\d,;.]{0,20}?"
     r"(?<![^\W\d_])(?:down(?:wards?)?|at (?:the )?bottom|unten|ned(?:over)?|nere?|nedåt|onder|beneden|(?:hacia )?abajo|"
     r"(?:para )?baixo|(?:vers le|en) bas|in basso|w dół|na dole|вниз\w*|снизу)(?![^\W\d_])|(?:标记|刻线|键槽)[朝向]?下)"
-)
-_HIGH_SIDE = (
+).pattern
+_HIGH_SIDE = re.compile(
     r"(?:high[- ]?side|h[øo]yside|h[öo]gside|oberseite|hochseite|hoge zijde|bovenzijde|lado (?:de )?alto|"
     r"lado (?:de )?(?:arriba|cima)|c[oô]t[eé] haut|lato alto|верхн\w+ сторон|верхн\w+ стенк|g[óo]rn\w+ stron|高边|上侧)"
-)
+).pattern
 _FROM_LOW = re.compile(
     rf"(?:^|[,;.])(?:(?!{_HIGH_SIDE})[^,;.])*?"
     rf"(?:{_ZERO}|(?<![^\W\d_])(?:from|von|ab|desde|a partir d[eo]|fra|från|depuis|vanaf|dal?|от|od)(?![^\W\d_])|从|自)"

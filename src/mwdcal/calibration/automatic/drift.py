@@ -44,7 +44,7 @@ HIDDEN_CHANCE = 0.1
 """The same chance where a trend would not show: a drift then widens the uncertainty many times, on less evidence."""
 TREND_CHANCE = 0.05
 """Chance of as much of a trend, of which little would show, below which it is a drift whatever its walk says."""
-LOST_TREND = 0.03
+LOST_TREND = 0.05
 """Share of a trend that residuals keep, below which it joins the fit on its own evidence alone.
 
 In a run that only warms it looks like a term of temperature, but for what is left within the soaks. One that is not

@@ -162,16 +162,16 @@ _CALLED_RUN = re.compile(
     r"(?<![^\W\d_])([ck]al|[ck]alib\w*|run|tumbl\w*|калибр\w*)(?![^\W\d_])|标定|校准", re.IGNORECASE
 )
 """Words of the title of a calibration run."""
-_WORD_OF_RUN = (
+_WORD_OF_RUN = re.compile(
     r"(?:runs?|series?|sets?|pass|trial|repeat|corridas?|pruebas?|ensay?i?os?|serien?|messreihe|messung|lauf|durchgang|"
     r"essais?|s[eé]rie|mesure|passe|m[aå]ling|m[aä]tning|ajo|meting|pomiar|seria|misura|prova|medi(?:da|[cç][aã]o|ci[oó]n)|"
     r"rodada|m[eě][rř]en[ií]|m[eé]r[eé]s|m[aă]sur[aă]toare|[oö]l[cç][uü]m|seri|pengukuran|l[aầ]n(?: đo)?|"
     r"сери[яи]|замер|прогон|измерение|вимірювання)"
-)
-_ORDINAL = (
+).pattern
+_ORDINAL = re.compile(
     r"(?:\d{1,2}|[ivx]{1,4}|[ab]|first|second|third|erster?|zweiter?|dritter?|primer[ao]?|primeir[ao]|segund[ao]|"
     r"premi[eè]re?|deuxi[eè]me|f[oø]rste|andre|перв\w+|втор\w+)"
-)
+).pattern
 _NUMBER_OF_RUN = re.compile(
     rf"\W*(?:{_WORD_OF_RUN}\W*(?:(?:no|nr|n[°º]|№)\W*)?(?P<behind>{_ORDINAL})(?![\w.,/-]*\d)(?![^\W\d_])|"
     rf"(?P<before>{_ORDINAL})(?:st|nd|rd|th|-?[йяе]|[.ªº°])*\s*{_WORD_OF_RUN}(?![^\W\d_])|"
