@@ -325,7 +325,10 @@ def with_drift(result: Fit, options: Options, triads: Bools, wrong: bool = False
 
 
 def _sized(result: Fit, triads: Bools) -> tuple[dict[str, Array], Array]:
-    """Trend and walk (B, 2) of each drift that acts on some triads (t,), and the variance of the noise left (B, t)."""
+    """Trend and walk (B, 2) of each drift that acts on some triads (t,), and the variance of the noise left (B, t).
+
+    A part that is not seen stays as declared.
+    """
     trends, triads = np.broadcast_to(triads, (2, triads.shape[-1]))
     problem, analysis = result.problem, result.analysis
     known, noise = declared_sizes(problem.evidence), drift.noise(problem)
@@ -334,8 +337,8 @@ def _sized(result: Fit, triads: Bools) -> tuple[dict[str, Array], Array]:
     scores = drift.walk_scores(problem, result.state, analysis, walks)
     parts = [(known.get(n, np.zeros((1, 2)))[:, i], noise[n]) for n, i in scores.components()]
     least = np.stack([(size / one) ** 2 for size, one in parts], -1)
-    lone = {name for name, triad in acting if triads[triad] and not trends[triad]}
-    held = np.array([name in lone and not part for name, part in scores.components()])
+    sized = {name: (trends[triad], triads[triad]) for name, triad in acting}
+    held = np.array([not sized[name][part] for name, part in scores.components()])
     theta, left = drift.walk_variances(
         scores, analysis.variance_factor, analysis.freedom, np.isnan(result.noise), least, held
     )
