@@ -7,7 +7,7 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 
-from cli_support import mwdcal, refused
+from cli_support import EXAMPLE, mwdcal, refused
 from test_fleet import alone, calibrated, check_same, roll_run, short_run, write_fleet
 
 pa = pytest.importorskip("pyarrow")
@@ -50,6 +50,17 @@ def test_each_tool_has_the_azimuths_of_its_own_file(folder):
     assert stated["made"] == "x"
     assert not {"lab", "declination_deg", "azimuth_reference"} & set(stated)
     assert "azimuths count from 3 norths, 0° to 7.5° from magnetic" in ran(folder).err
+
+
+def test_a_broken_parquet_file_costs_the_run_files_beside_it_nothing(folder):
+    shutil.copy(EXAMPLE / "run.csv", folder / "a.csv")
+    (folder / "b.parquet").write_text("no table", "utf-8")
+    done = ran(folder)
+    assert done.code == 0, done.err
+    status = {
+        r["serial"]: r["status"] for r in pq.read_table(folder.parent / "o.parquet").to_pylist()
+    }
+    assert status == {"SIM-0001": "ok", "b": "bad-input"}
 
 
 def test_mixed_rows_keep_the_azimuths_of_their_file(folder):

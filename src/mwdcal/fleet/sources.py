@@ -206,10 +206,11 @@ def open_source(
     Run files are read by the `profile`.
     """
     paths, others = input_files(path)
-    mixed = any(file.suffix.lower() != PARQUET or _has_repeats(file) for file in paths)
-    files = []
+    of_runs = {file for file in paths if file.suffix.lower() != PARQUET or _has_repeats(file)}
+    mixed, files = bool(of_runs), []
     for count, file in enumerate(paths, 1):
-        files.append(_described(file, path, profile) if mixed else _look(file, path))
+        is_run = file in of_runs
+        files.append(_described(file, path, profile, is_run) if mixed else _look(file, path))
         progress(f"file {count} of {len(paths)} read")
     if not mixed:
         _check_same_columns(path, paths, files)
@@ -297,9 +298,9 @@ def input_files(path: Path) -> tuple[list[Path], list[Path]]:
     return paths, [file for file in visible if file.suffix.lower() not in SUFFIXES]
 
 
-def _described(file: Path, root: Path, profile: Profile) -> _File:
-    """One file of a folder with run files; what is wrong with it is data."""
-    if file.suffix.lower() != PARQUET or _has_repeats(file):
+def _described(file: Path, root: Path, profile: Profile, is_run: bool) -> _File:
+    """One file of a folder with run files, which this one `is_run` or not; what is wrong with it is data."""
+    if is_run:
         return _look_at_runs(file, root, profile)
     try:
         table = _look(file, root)
@@ -312,23 +313,29 @@ def _described(file: Path, root: Path, profile: Profile) -> _File:
 
 
 def _has_repeats(file: Path) -> bool:
-    """Whether rows of a Parquet file that follow each other have one tool and label: it is read as a run file is."""
+    """Whether rows of a Parquet file that follow each other have one tool and label: it is read as a run file is.
+
+    A file or column that cannot be read is refused where it is looked at for its rows, and not here.
+    """
     arrow, pq = parquet.modules(str(file))
     import pyarrow.compute as compute
 
-    with parquet.reading(str(file)), pq.ParquetFile(file) as opened:
+    with (
+        suppress(InputError, arrow.ArrowException),
+        parquet.reading(str(file)),
+        pq.ParquetFile(file) as opened,
+    ):
         names = {*opened.schema_arrow.names}
         if not {_LABEL, "ax"} <= names or opened.metadata.num_rows > runs.MOST_ROWS:
             return False
-        with suppress(arrow.ArrowException):  # of cells that are refused where they are read
-            same = True
-            for column in opened.read([_LABEL, *{SERIAL} & names]).combine_chunks().columns:
-                column.validate(full=True)
-                cells = column.cast(cell_type(column.type))
-                same = compute.and_(same, compute.equal(cells[1:], cells[:-1]))
-                if arrow.types.is_string(cells.type) or arrow.types.is_large_string(cells.type):
-                    same = compute.and_(same, compute.not_equal(cells[1:], ""))
-            return compute.any(same).as_py() is True
+        same = True
+        for column in opened.read([_LABEL, *{SERIAL} & names]).combine_chunks().columns:
+            column.validate(full=True)
+            cells = column.cast(cell_type(column.type))
+            same = compute.and_(same, compute.equal(cells[1:], cells[:-1]))
+            if arrow.types.is_string(cells.type) or arrow.types.is_large_string(cells.type):
+                same = compute.and_(same, compute.not_equal(cells[1:], ""))
+        return compute.any(same).as_py() is True
     return False
 
 
