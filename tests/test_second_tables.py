@@ -323,7 +323,7 @@ def test_the_day_of_the_calibration_in_the_title_of_a_roll_test_is_not_its_own(
     "line", ["Roll test 13.03.2026", "Check due 13.03.2026", "Verified 13.03.2026"]
 )
 def test_the_day_behind_a_title_is_that_of_a_roll_test_only(tmp_path: Path, line: str) -> None:
-    """The day of the next check, or of a signature, is none of the measurement."""
+    """The day of the next check or of a signature is not the day of the measurement."""
     both = facts(tmp_path, A, ["", line])
     assert both[1][1] == ("2026-03-13" if line.startswith("Roll") else "2026-11-24")
 

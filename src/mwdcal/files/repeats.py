@@ -128,9 +128,8 @@ def repeats(table: Table, sources: Mapping[str, ColumnSource]) -> Repeats | None
         return None
     if not same.any():
         return None
-    partly = (
-        labelled and "toolface" in angles
-    )  # else labels may be of directions, about which a tool is rolled
+    # Without toolfaces labels may be of directions, about which a tool is rolled.
+    partly = labelled and "toolface" in angles
     starts = _without_differing(table, names, sources, _starts(same), partly)
     sizes = np.diff(starts, append=table.count)
     if sizes.max() < 2 or (not labelled and not _are_most(sizes)):

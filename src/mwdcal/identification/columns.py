@@ -830,20 +830,19 @@ def _toolfaces_by_words(
 ) -> dict[str, Resemblance]:
     """The toolfaces that a line, or their name, says to count anticlockwise or from the low side."""
     results = {}
+    every_turned, every_low = (
+        any(map(says, above)) for says in (_says_anticlockwise, _says_from_low_side)
+    )
     for name, each in meanings.items():
-        if each.column == REFERENCES["toolface"].column and unit_of(each.unit) in (
-            "",
-            "°",
-            ANTICLOCKWISE,
-        ):
-            turned = each.unit == ANTICLOCKWISE or any(map(_says_anticlockwise, above))
-            low = _FROM_LOW.search(name) or any(map(_says_from_low_side, above))
-            unit = (
-                (ANTICLOCKWISE if turned else each.unit)
-                if not low
-                else (ANTICLOCKWISE_FROM_LOW_SIDE if turned else FROM_LOW_SIDE)
-            )
-            results[name] = each._replace(unit=unit)
+        known = unit_of(each.unit) in ("", "°", ANTICLOCKWISE)
+        if each.column != REFERENCES["toolface"].column or not known:
+            continue
+        turned = every_turned or each.unit == ANTICLOCKWISE
+        if every_low or _FROM_LOW.search(name):
+            unit = ANTICLOCKWISE_FROM_LOW_SIDE if turned else FROM_LOW_SIDE
+        else:
+            unit = ANTICLOCKWISE if turned else each.unit
+        results[name] = each._replace(unit=unit)
     return results
 
 

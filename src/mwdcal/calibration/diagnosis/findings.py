@@ -248,7 +248,7 @@ def unused_columns(columns: Sequence[str]) -> list[Finding]:
 
 _OF_THE_EARTH = {
     "ref_gravity_g": ", or no gravity on Earth (9.76 to 9.84 m/s²)",
-    "ref_field_nt": ", or no field on Earth (15,000 to 80,000 nT)",
+    "ref_field_nt": ", or no field on Earth ({:,.0f} to {:,.0f} nT)".format(*EARTH_RANGES["field"]),
 }
 """A third reason why a line is not taken, by column of a run file."""
 

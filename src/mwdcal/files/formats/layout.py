@@ -1437,7 +1437,7 @@ def _table(sheet: Sheet, span: _Span, source: str, decimal: str) -> Layout | Non
         fractions=tuple(
             n for n, column in zip(names, columns, strict=True) if any(map(_is_fraction, column))
         ),
-        above=tuple(" ".join(map(as_text, row)).strip() for row in above),
+        above=tuple(map(_line, above)),
         heading=_words(blocks[0][-1][1]) if blocks[0] and not _is_reading(above[-1]) else "",
         titles=block._replace(metadata=dated(block.metadata, zip(names, texts, strict=True))),
         left_out=tuple(

@@ -15,13 +15,13 @@ from functools import cache
 from itertools import pairwise, product, zip_longest
 from typing import NamedTuple
 
-from mwdcal.calibration.readings import EARTH_GRAVITY
+from mwdcal.calibration.readings import EARTH_GRAVITY, EARTH_RANGES
 from mwdcal.files.formats.columns import as_text, looks_numeric, without_marks
 from mwdcal.files.formats.settings import LONGEST_STATEMENT, settings_in
 from mwdcal.files.formats.titles import Titles, titles, unread_declination
 from mwdcal.files.synonyms import FACTORS, unit_of
 
-EARTH_FIELD = (15_000.0, 80_000.0)
+EARTH_FIELD = EARTH_RANGES["field"]
 """The least and the largest strength of the Earth's field, nT, with room for what is built around a stand."""
 
 
